@@ -1,0 +1,1 @@
+"""uwsfm: refractive underwater Structure-from-Motion for rigs behind ports."""

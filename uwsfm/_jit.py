@@ -1,0 +1,57 @@
+"""The one decorator for compiled kernels, and where their machine code is kept.
+
+Numba keys its cache by the file of the outermost function only, so an edit in a
+kernel's callee would go unnoticed. Keying the cache folder by the source of the whole
+package makes stale code impossible; a folder that cannot be written (read-only home)
+moves to the temporary directory, and failing that, kernels compile in each process.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable)
+
+
+def _source_key() -> str:
+    digest = hashlib.sha1(numba.__version__.encode())
+    root = Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_dir() -> Path | None:
+    home = os.environ.get("UWSFM_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    candidates = [
+        Path(home) if home else Path.home() / ".cache",
+        Path(tempfile.gettempdir()) / f"uwsfm-{user}",
+    ]
+    for base in candidates:
+        folder = base / "uwsfm" / "kernels" / _source_key()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+CACHE_DIR = _cache_dir()
+if CACHE_DIR is not None:
+    numba.config.CACHE_DIR = str(CACHE_DIR)
+
+
+def kernel(function: Function) -> Function:
+    """Compile with numba: releases the GIL, IEEE division, cached on disk."""
+    return numba.njit(cache=CACHE_DIR is not None, nogil=True, error_model="numpy")(
+        function
+    )

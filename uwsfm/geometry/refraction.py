@@ -1,0 +1,119 @@
+"""Refraction at parallel planes: Snell's law and the flat-port equation.
+
+Scalar kernels; failure is NaN. Equations: Sedlazeck & Koch (BMVC 2011) eq. 1-4 in
+vector form; the projection equation after Agrawal et al. (CVPR 2012), who showed that
+all rays through a flat port meet the axis along its normal.
+"""
+
+import math
+
+from uwsfm._jit import kernel
+
+MAX_STEPS = 60
+
+
+@kernel
+def refract(dx, dy, dz, nx, ny, nz, ratio):
+    """Refract a unit direction at a plane, by Snell's law in vector form.
+
+    Args:
+        dx, dy, dz: unit direction with <n, d> > 0.
+        nx, ny, nz: unit normal pointing into the second medium.
+        ratio: index of the first medium over that of the second.
+
+    Returns:
+        The unit direction in the second medium; NaN on total internal reflection.
+    """
+    c = nx * dx + ny * dy + nz * dz
+    k = 1.0 - ratio * ratio * (1.0 - c * c)
+    if not k > 0.0:
+        return math.nan, math.nan, math.nan
+    s = math.sqrt(k) - ratio * c
+    return ratio * dx + s * nx, ratio * dy + s * ny, ratio * dz + s * nz
+
+
+@kernel
+def slope(index, u):
+    """s = (n^2 + (n^2 - 1) u)^(-1/2): tan(theta in the layer) / tan(theta in air)."""
+    square = index * index
+    return 1.0 / math.sqrt(square + (square - 1.0) * u)
+
+
+@kernel
+def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
+    """Solve the flat-port equation for q = tan(theta in air) / |r|.
+
+        F(q) = q (d + t s_g + h s_w) - 1 = 0,   s_i from `slope` at u = q^2 r2
+
+    F is smooth on the axis. For indices >= air it is increasing and concave, so the
+    paraxial root is a lower bound; Halley steps from a slightly better start take 1-3
+    iterations at usual angles. Other orders of the indices have a critical angle where
+    F goes to infinity, and are solved between brackets.
+
+    Args:
+        height: depth h of the point behind the outer surface, > 0.
+        r2: squared distance of the point from the axis.
+        dist: camera to inner surface, along the normal.
+        thick: glass thickness.
+        n_glass, n_water: indices relative to air.
+
+    Returns:
+        q; NaN if no ray joins the point and the camera.
+    """
+    if n_water < 1.0 or (n_glass < 1.0 and thick > 0.0):
+        return _solve_bracketed(height, r2, dist, thick, n_glass, n_water)
+    paraxial = dist + thick / n_glass + height / n_water
+    if not paraxial > 0.0:
+        return math.nan
+    q_low = 1.0 / paraxial
+    s = 1.0 - (1.0 - 1.0 / (n_water * n_water)) * r2 * q_low * q_low
+    q = q_low / math.sqrt(s) if s > 0.02 else q_low
+    g2, w2 = n_glass * n_glass, n_water * n_water
+    for _ in range(MAX_STEPS):
+        u = q * q * r2
+        s_g, s_w = slope(n_glass, u), slope(n_water, u)
+        f = q * (dist + thick * s_g + height * s_w) - 1.0
+        sg3, sw3 = s_g * s_g * s_g, s_w * s_w * s_w
+        f1 = dist + thick * g2 * sg3 + height * w2 * sw3
+        sg5, sw5 = sg3 * s_g * s_g, sw3 * s_w * s_w
+        f2 = thick * g2 * (g2 - 1.0) * sg5 + height * w2 * (w2 - 1.0) * sw5
+        # Uncapped Halley diverges near grazing incidence: cap F F'' at 0.7 F'^2.
+        curvature = min(-3.0 * q * r2 * f2 * f, 0.7 * f1 * f1)
+        q = max(q - 2.0 * f * f1 / (2.0 * f1 * f1 - curvature), q_low)
+        if abs(f) < 1e-10:  # cubic: the step just taken is exact to rounding
+            return q
+    return math.nan
+
+
+@kernel
+def _solve_bracketed(height, r2, dist, thick, n_glass, n_water):
+    """The same root for any order of the indices, by Newton between brackets."""
+    u_max = math.inf
+    if n_water < 1.0:
+        u_max = n_water * n_water / (1.0 - n_water * n_water)
+    if n_glass < 1.0 and thick > 0.0:
+        u_max = min(u_max, n_glass * n_glass / (1.0 - n_glass * n_glass))
+    paraxial = dist + thick / n_glass + height / n_water
+    if r2 == 0.0 or not paraxial > 0.0:
+        return 1.0 / paraxial
+    low = 0.0
+    high = math.sqrt(u_max / r2)
+    q = min(1.0 / paraxial, 0.5 * high)
+    for _ in range(4 * MAX_STEPS):
+        u = q * q * r2
+        s_g = slope(n_glass, u) if thick > 0.0 else 0.0
+        s_w = slope(n_water, u)
+        f = q * (dist + thick * s_g + height * s_w) - 1.0
+        f1 = dist + thick * n_glass * n_glass * s_g**3
+        f1 += height * n_water * n_water * s_w**3
+        if f > 0.0:
+            high = q
+        else:
+            low = q
+        step = q - f / f1
+        inside = low < step < high
+        q_next = step if inside else 0.5 * (low + high)
+        if abs(q_next - q) <= 2e-16 * q:
+            return q_next
+        q = q_next
+    return q

@@ -1,0 +1,251 @@
+"""In-air lenses: from a viewing direction to a pixel and back, with the Jacobian.
+
+Seven COLMAP camera models are two kernels: every Brown model is FULL_OPENCV with zeros,
+and OPENCV_FISHEYE stands alone. A lens is one row of LENS_SIZE numbers
+
+    [fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, kind, limit]
+
+where ``kind`` is 0 (no distortion), 1 (Brown) or 2 (fisheye) and ``limit`` is the
+largest squared radius (Brown) or angle (fisheye) up to which the radial distortion
+grows: beyond it a second, false ray would share the pixel. Pixels follow COLMAP: the
+centre of the first pixel is (0.5, 0.5).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from uwsfm._jit import kernel
+from uwsfm.errors import InputError
+from uwsfm.geometry.rigid3 import Array
+
+LENS_SIZE = 14
+PINHOLE, BROWN, FISHEYE = 0, 1, 2
+
+# Where each COLMAP model keeps its parameters in the common row.
+_SLOTS: dict[str, tuple[int, ...]] = {
+    "SIMPLE_PINHOLE": (0, 2, 3),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 2, 3, 4),
+    "RADIAL": (0, 2, 3, 4, 5),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
+    "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 8, 9),
+}
+SUPPORTED_MODELS = tuple(_SLOTS)
+
+
+def lens_row(model: str, params: Sequence[float] | Array) -> Array:
+    """The row (LENS_SIZE,) of a COLMAP camera model and its parameters.
+
+    Raises:
+        InputError: the model has no kernel here, or the parameters do not fit it.
+    """
+    if model not in _SLOTS:
+        raise InputError(
+            f"camera model {model} has no projection here; "
+            f"use one of {', '.join(SUPPORTED_MODELS)}"
+        )
+    slots = _SLOTS[model]
+    values = np.asarray(params, dtype=np.float64)
+    if values.shape != (len(slots),) or not np.all(np.isfinite(values)):
+        raise InputError(
+            f"camera model {model} takes {len(slots)} finite parameters, "
+            f"got {values.tolist()}"
+        )
+    row = np.zeros(LENS_SIZE)
+    row[list(slots)] = values
+    if 1 not in slots:
+        row[1] = row[0]
+    if row[0] <= 0.0 or row[1] <= 0.0:
+        raise InputError(f"camera model {model}: the focal length must be positive")
+    if model == "OPENCV_FISHEYE":
+        row[12] = FISHEYE
+        row[13] = _fisheye_limit(row)
+    else:
+        row[12] = BROWN if np.any(row[4:12] != 0.0) else PINHOLE
+        row[13] = _brown_limit(row)
+    return row
+
+
+def _smallest_positive_root(coefficients: Array) -> float:
+    """The smallest positive real root of a polynomial, lowest power first; or inf."""
+    trimmed = np.trim_zeros(np.asarray(coefficients, dtype=np.float64), "b")
+    if len(trimmed) < 2:
+        return math.inf
+    roots = np.polynomial.polynomial.polyroots(trimmed)
+    real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
+    positive = real[real > 0.0]
+    return float(positive.min()) if len(positive) else math.inf
+
+
+def _brown_limit(row: Array) -> float:
+    """Smallest s = r^2 where d(r N(s) / D(s)) / dr = 0 or the denominator vanishes."""
+    num = np.array([1.0, row[4], row[5], row[8]])
+    den = np.array([1.0, row[9], row[10], row[11]])
+    poly = np.polynomial.polynomial
+    slope = poly.polymul(poly.polyder(num), den)
+    slope = poly.polysub(slope, poly.polymul(num, poly.polyder(den)))
+    turning = poly.polyadd(poly.polymul(num, den), poly.polymul([0.0, 2.0], slope))
+    return min(_smallest_positive_root(turning), _smallest_positive_root(den))
+
+
+def _fisheye_limit(row: Array) -> float:
+    """Smallest angle where d(theta_d) / d(theta) = 0, at most 90 degrees."""
+    k1, k2, k3, k4 = row[4], row[5], row[8], row[9]
+    square = _smallest_positive_root(np.array([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4]))
+    return min(math.sqrt(square), 0.5 * math.pi)
+
+
+@kernel
+def distort(u, v, lens):
+    """Distorted (u, v), and d(distorted) / d(u, v) as 4 scalars; NaN out of range."""
+    if lens[12] == 0.0:
+        return u, v, 1.0, 0.0, 0.0, 1.0
+    if lens[12] == 1.0:
+        return _distort_brown(u, v, lens)
+    return _distort_fisheye(u, v, lens)
+
+
+@kernel
+def _distort_brown(u, v, lens):
+    s = u * u + v * v
+    if not s < lens[13]:
+        return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    p1, p2 = lens[6], lens[7]
+    num = 1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))
+    den = 1.0 + s * (lens[9] + s * (lens[10] + s * lens[11]))
+    num_s = lens[4] + s * (2.0 * lens[5] + s * 3.0 * lens[8])
+    den_s = lens[9] + s * (2.0 * lens[10] + s * 3.0 * lens[11])
+    radial = num / den
+    radial_s = (num_s - radial * den_s) / den
+    x = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
+    y = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
+    xu = radial + 2.0 * u * u * radial_s + 2.0 * p1 * v + 6.0 * p2 * u
+    xv = 2.0 * u * v * radial_s + 2.0 * p1 * u + 2.0 * p2 * v
+    yv = radial + 2.0 * v * v * radial_s + 6.0 * p1 * v + 2.0 * p2 * u
+    return x, y, xu, xv, xv, yv
+
+
+@kernel
+def _fisheye_angle(theta, lens):
+    """theta_d and its derivative: theta (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)."""
+    s = theta * theta
+    k1, k2, k3, k4 = lens[4], lens[5], lens[8], lens[9]
+    value = theta * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
+    slope = 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * 9.0 * k4)))
+    return value, slope
+
+
+@kernel
+def _distort_fisheye(u, v, lens):
+    s = u * u + v * v
+    radius = math.sqrt(s)
+    theta = math.atan(radius)
+    if not theta < lens[13]:
+        return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
+    if radius < 1e-8:  # theta_d / r = 1 + O(r^2) to rounding
+        return u, v, 1.0, 0.0, 0.0, 1.0
+    value, slope = _fisheye_angle(theta, lens)
+    scale = value / radius
+    # d(scale) / d(radius) / radius
+    scale_r = (slope / (1.0 + s) - scale) / s
+    xv = u * v * scale_r
+    return u * scale, v * scale, scale + u * u * scale_r, xv, xv, scale + v * v * scale_r
+
+
+@kernel
+def img_from_dir(x, y, z, lens):
+    """Pixel of a direction in the camera frame, and d(pixel) / d(x, y, z).
+
+    Returns:
+        (px, py, J11, J12, J13, J21, J22, J23); NaN behind the camera or out of the
+        range of the lens.
+    """
+    nan = math.nan
+    if not z > 0.0:
+        return nan, nan, nan, nan, nan, nan, nan, nan
+    inv_z = 1.0 / z
+    u, v = x * inv_z, y * inv_z
+    ud, vd, a11, a12, a21, a22 = distort(u, v, lens)
+    fx, fy = lens[0] * inv_z, lens[1] * inv_z
+    return (
+        lens[0] * ud + lens[2],
+        lens[1] * vd + lens[3],
+        fx * a11,
+        fx * a12,
+        -fx * (a11 * u + a12 * v),
+        fy * a21,
+        fy * a22,
+        -fy * (a21 * u + a22 * v),
+    )
+
+
+@kernel
+def dir_from_img(px, py, lens):
+    """Unit direction in the camera frame of a pixel; NaN where none exists."""
+    nan = math.nan
+    xd = (px - lens[2]) / lens[0]
+    yd = (py - lens[3]) / lens[1]
+    if lens[12] == 2.0:
+        return _dir_from_fisheye(xd, yd, lens)
+    u, v = xd, yd
+    if lens[12] == 1.0:
+        u, v = _undistort_brown(xd, yd, lens)
+    norm = math.sqrt(1.0 + u * u + v * v)
+    if not norm < math.inf:
+        return nan, nan, nan
+    return u / norm, v / norm, 1.0 / norm
+
+
+@kernel
+def _undistort_brown(xd, yd, lens):
+    """Newton on the distortion, halved where it would leave the invertible disc."""
+    u, v = xd, yd
+    s = u * u + v * v
+    if not s < lens[13]:
+        shrink = 0.9 * math.sqrt(lens[13] / s)
+        u, v = u * shrink, v * shrink
+    for _ in range(60):
+        x, y, a11, a12, a21, a22 = distort(u, v, lens)
+        ex, ey = x - xd, y - yd
+        det = a11 * a22 - a12 * a21
+        du, dv = (a22 * ex - a12 * ey) / det, (a11 * ey - a21 * ex) / det
+        step = 1.0
+        while not (u - step * du) ** 2 + (v - step * dv) ** 2 < lens[13]:
+            step *= 0.5
+            if step < 1e-3:
+                return math.nan, math.nan
+        u, v = u - step * du, v - step * dv
+        if du * du + dv * dv <= 1e-28 * (1.0 + u * u + v * v) and step == 1.0:
+            return u, v
+    return math.nan, math.nan
+
+
+@kernel
+def _dir_from_fisheye(xd, yd, lens):
+    nan = math.nan
+    target = math.sqrt(xd * xd + yd * yd)
+    if target < 1e-12:
+        return xd, yd, 1.0
+    limit, _ = _fisheye_angle(lens[13], lens)
+    if not target < limit:
+        return nan, nan, nan
+    low, high = 0.0, lens[13]
+    theta = min(target, 0.5 * (low + high))
+    for _ in range(100):  # monotonic up to the limit: Newton inside a bracket
+        value, slope = _fisheye_angle(theta, lens)
+        if value > target:
+            high = theta
+        else:
+            low = theta
+        moved = theta - (value - target) / slope
+        if not low <= moved <= high:
+            moved = 0.5 * (low + high)
+        if abs(moved - theta) <= 1e-15 * theta:
+            theta = moved
+            break
+        theta = moved
+    scale = math.sin(theta) / target
+    return xd * scale, yd * scale, math.cos(theta)
