@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import PurePosixPath, PureWindowsPath
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +22,10 @@ if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
 
 UNIT_TOLERANCE = 1e-9
 """Quaternions and normals nearer to unit length than this are taken as they are."""
+# Hand-copied unit vectors and rotations have few decimals; more than this is a mistake.
+_COPY_TOLERANCE = 1e-3
+# A rectilinear lens this short would see 157 degrees: a length in millimetres.
+_MIN_FOCAL_PER_SIDE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,32 +61,47 @@ class Rig:
     """Standard deviation of the baseline; 0 holds it exactly."""
 
     def __post_init__(self) -> None:
-        if len(self.cameras) < 2:
-            raise InputError(
-                f"a rig needs at least two cameras, got {len(self.cameras)}: "
-                "the baseline between them is the only source of scale"
-            )
-        for what in ("name", "images"):
-            values = [getattr(camera, what) for camera in self.cameras]
-            if len(set(values)) < len(values):
-                raise InputError(f"cameras of a rig share the same {what}: {values}")
-        waters = sorted({camera.port.n_water for camera in self.cameras})
-        if len(waters) > 1:
-            raise InputError(f"the ports of a rig are in different waters: {waters}")
+        self._check_cameras()
         if not 0.0 < self.baseline_m < np.inf:
-            raise InputError(f"rig baseline must be positive, got {self.baseline_m} m")
+            raise InputError(f"baseline_m: {self.baseline_m:g} m gives no scale")
         if not 0.0 <= self.baseline_stddev_m <= self.baseline_m:
             raise InputError(
-                "rig baseline_stddev_m must lie between 0 and the baseline, got "
-                f"{self.baseline_stddev_m} for a baseline of {self.baseline_m} m"
+                f"baseline_stddev_m: {self.baseline_stddev_m:g} m should lie between 0 "
+                f"and the baseline, {self.baseline_m:g} m"
             )
         if self.cam_from_rig is not None:
             object.__setattr__(self, "cam_from_rig", self._checked_poses())
         elif len(self.cameras) != 2:
             raise InputError(
-                "a baseline length alone describes a rig of two cameras, "
+                "cameras: a baseline length alone describes a rig of two cameras, "
                 f"this one has {len(self.cameras)}"
             )
+
+    def _check_cameras(self) -> None:
+        if len(self.cameras) < 2:
+            raise InputError(
+                f"cameras: at least two are needed, got {len(self.cameras)}: "
+                "the baseline between them is the only source of scale"
+            )
+        for j, camera in enumerate(self.cameras):
+            for i, other in enumerate(self.cameras[:j]):
+                if camera.name == other.name:
+                    raise InputError(
+                        f"cameras[{j}].name: {camera.name!r} is also the name of "
+                        f"cameras[{i}]"
+                    )
+                # COLMAP tells cameras apart by the beginning of the image path.
+                mine, theirs = f"{camera.images}/", f"{other.images}/"
+                if mine.startswith(theirs) or theirs.startswith(mine):
+                    raise InputError(
+                        f"cameras[{j}].images: {camera.images!r} and the folder of "
+                        f"cameras[{i}], {other.images!r}, hold the same images"
+                    )
+            if camera.port.n_water != self.cameras[0].port.n_water:
+                raise InputError(
+                    f"cameras[{j}].port: its water index, {camera.port.n_water:g}, is "
+                    f"not that of cameras[0], {self.cameras[0].port.n_water:g}"
+                )
 
     def _checked_poses(self) -> Array:
         """A read-only copy of `cam_from_rig` (C, 7)."""
@@ -98,6 +119,8 @@ class Rig:
                 "the first camera is the reference of the rig: its cam_from_rig must "
                 f"be the identity, got {poses[0]}"
             )
+        if not np.all(np.any(poses[1:, 4:], axis=1)):
+            raise InputError("cam_from_rig: a translation of length zero")
         baseline = float(np.linalg.norm(poses[1, 4:]))
         # A guard against a silent change of scale, not against rounding.
         if abs(baseline - self.baseline_m) > UNIT_TOLERANCE * self.baseline_m:
@@ -124,3 +147,200 @@ class Rig:
             cam_from_rig=poses,
             baseline_m=float(np.linalg.norm(poses[1, 4:])),
         )
+
+
+def lens_models() -> list[str]:
+    """COLMAP camera models that can look through a port, by name."""
+    import pycolmap
+
+    names = pycolmap.CameraModelId.__members__
+    return [n for n in names if n not in ("INVALID", "EQUIRECTANGULAR")]
+
+
+def camera_from_colmap(
+    model: str, width: int, height: int, params: Sequence[float]
+) -> pycolmap.Camera:
+    """Intrinsics in air by COLMAP model name and parameters (COLMAP pixel origin).
+
+    Raises:
+        InputError: an unknown model, a wrong number of parameters, a focal length or
+            principal point that cannot belong to an image of this size.
+    """
+    import pycolmap
+
+    if model not in lens_models():
+        raise InputError(
+            f"{model!r} is not a COLMAP camera model for a port; choose from "
+            f"{', '.join(lens_models())}"
+        )
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+    names = camera.params_info.split(", ")
+    if len(params) != len(names):
+        raise InputError(
+            f"{model} has {len(names)} parameters ({camera.params_info}), "
+            f"got {len(params)}"
+        )
+    for k in camera.focal_length_idxs():
+        if params[k] < _MIN_FOCAL_PER_SIDE * max(width, height):
+            raise InputError(
+                f"{names[k]} = {params[k]:g} is not the focal length in pixels of an "
+                f"image of {width} x {height}; is it in millimetres?"
+            )
+    for k, side in zip(camera.principal_point_idxs(), (width, height), strict=True):
+        if not 0 <= params[k] <= side:
+            raise InputError(
+                f"{names[k]} = {params[k]:g} puts the principal point outside the "
+                f"image of {width} x {height}"
+            )
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def camera_from_opencv(
+    width: int,
+    height: int,
+    camera_matrix: ArrayLike,
+    distortion: ArrayLike,
+    *,
+    fisheye: bool,
+    pixel_origin: Literal["opencv", "colmap"],
+) -> pycolmap.Camera:
+    """Intrinsics in air from OpenCV's calibrateCamera or fisheye.calibrate.
+
+    Args:
+        width: Of the image, pixels.
+        height: Of the image, pixels.
+        camera_matrix: (3, 3), pixels.
+        distortion: 0, 4, 5 or 8 values k1, k2, p1, p2, k3, k4, k5, k6; if ``fisheye``,
+            4 values k1, k2, k3, k4.
+        fisheye: The calibration is one of ``cv2.fisheye``.
+        pixel_origin: Where the centre of the first pixel lies: "opencv" at (0, 0),
+            "colmap" at (0.5, 0.5).
+
+    Raises:
+        InputError: not a camera matrix, skew, a wrong number of distortion values, or
+            as `camera_from_colmap`.
+    """
+    (fx, skew, cx), (zero, fy, cy), last = np.asarray(camera_matrix, float).tolist()
+    if skew != 0:
+        raise InputError(
+            f"camera_matrix has a skew of {skew:g}, which COLMAP's lens models lack; "
+            "calibrate without skew"
+        )
+    if zero != 0 or last != [0, 0, 1]:
+        raise InputError("camera_matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    allowed = (4,) if fisheye else (0, 4, 5, 8)
+    values = np.ravel(distortion).tolist()
+    if len(values) not in allowed:
+        raise InputError(
+            f"distortion of {'a fisheye' if fisheye else 'an OpenCV'} calibration has "
+            f"{' or '.join(map(str, allowed))} values, got {len(values)}"
+        )
+    if fisheye:
+        model = "OPENCV_FISHEYE"
+    elif not values:
+        model = "PINHOLE"
+    elif any(values[4:]):
+        model, values = "FULL_OPENCV", [*values, 0.0, 0.0, 0.0][:8]
+    else:
+        model, values = "OPENCV", values[:4]
+    shift = 0.5 if pixel_origin == "opencv" else 0.0  # OpenCV -> COLMAP pixel origin
+    params = [fx, fy, cx + shift, cy + shift, *values]
+    return camera_from_colmap(model, width, height, params)
+
+
+# ---- What the numbers of a rig may be: each returns its value or raises InputError ---
+
+
+def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float:
+    """Refuses negative lengths, and millimetres taken for metres."""
+    if value < 0:
+        raise InputError(f"{value:g} m is negative; a {noun} cannot be")
+    if value > limit:
+        guess = np.format_float_positional(value / 1000, min_digits=3)
+        raise InputError(
+            f"{value:g} m is not a {noun}; {plural} are in metres, "
+            f"did you mean {guess}?"
+        )
+    return value
+
+
+def checked_port_distance(value: float) -> float:
+    """From the camera to the glass, metres."""
+    return _checked_metres(value, "port distance", "distances", 0.5)
+
+
+def checked_thickness(value: float) -> float:
+    """Of the glass, metres."""
+    return _checked_metres(value, "glass thickness", "thicknesses", 0.5)
+
+
+def checked_baseline(value: float) -> float:
+    """Between two cameras, metres."""
+    if value == 0:
+        raise InputError("a baseline of length zero gives no scale")
+    return _checked_metres(value, "baseline", "baselines", 10.0)
+
+
+def checked_index(value: float) -> float:
+    """A refractive index of water, glass or plastic."""
+    if not 1 <= value <= 2.5:
+        raise InputError(
+            f"{value:g} is not a refractive index; expected 1 to 2.5 "
+            "(water about 1.33, acrylic 1.49, glass 1.46 to 1.52)"
+        )
+    return value
+
+
+def checked_unit(values: tuple[float, ...]) -> tuple[float, ...]:
+    """A vector or quaternion of unit length, made exact if it was rounded."""
+    length = math.hypot(*values)
+    if abs(length - 1) > _COPY_TOLERANCE:
+        raise InputError(f"must have length 1, has length {length:.4g}")
+    if abs(length - 1) <= UNIT_TOLERANCE:
+        return values
+    return tuple(value / length for value in values)
+
+
+def checked_normal(values: tuple[float, ...]) -> tuple[float, ...]:
+    """A port normal (3,), which goes from the camera to the water."""
+    if values[2] <= 0:
+        raise InputError(
+            "points back at the camera (its z must be positive): the normal goes from "
+            "the camera to the water, is its sign flipped?"
+        )
+    return checked_unit(values)
+
+
+def checked_rotation(
+    rows: tuple[tuple[float, ...], ...],
+) -> tuple[tuple[float, ...], ...]:
+    """A rotation matrix (3, 3), as its rows."""
+    matrix = np.array(rows)
+    off = np.max(np.abs(matrix @ matrix.T - np.eye(3)))
+    if not off <= _COPY_TOLERANCE:
+        raise InputError(
+            "is not a rotation: rows must have length 1 and be perpendicular, they are "
+            f"off by {off:.2g}"
+        )
+    if np.linalg.det(matrix) < 0:
+        raise InputError("is a reflection (determinant -1), not a rotation")
+    return rows
+
+
+def checked_text(value: str) -> str:
+    """A name: one line, not blank."""
+    if not value.strip() or not value.isprintable():
+        raise InputError(f"must be one line of text, not {value!r}")
+    return value
+
+
+def checked_folder(value: str) -> str:
+    """A folder inside the image directory, with forward slashes and no dots."""
+    path = PurePosixPath(checked_text(value))
+    if "\\" in value:
+        raise InputError(f"write {value!r} with forward slashes")
+    absolute = path.is_absolute() or PureWindowsPath(value).drive
+    if absolute or ".." in path.parts or not path.parts:
+        raise InputError(f"{value!r} must be a folder inside the image directory")
+    return str(path)

@@ -152,7 +152,14 @@ def _distort_fisheye(u, v, lens):
     # d(scale) / d(radius) / radius
     scale_r = (slope / (1.0 + s) - scale) / s
     xv = u * v * scale_r
-    return u * scale, v * scale, scale + u * u * scale_r, xv, xv, scale + v * v * scale_r
+    return (
+        u * scale,
+        v * scale,
+        scale + u * u * scale_r,
+        xv,
+        xv,
+        scale + v * v * scale_r,
+    )
 
 
 @kernel

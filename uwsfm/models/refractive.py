@@ -13,6 +13,7 @@ from uwsfm.models.port import FlatPort
 from uwsfm.models.status import VALID
 
 StatusArray = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
 class InAirCamera(Protocol):
@@ -108,7 +109,7 @@ class RefractiveCamera:
         """Reason codes (N,) of `ray_from_img`, see `uwsfm.Status`."""
         return self._unproject(xy)[1]
 
-    def img_from_point(self, points_in_cam: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    def img_from_point(self, points_in_cam: ArrayLike) -> tuple[Array, Mask]:
         """Exact projection of points in the water.
 
         Args:
@@ -130,7 +131,7 @@ class RefractiveCamera:
 
     def img_from_point_with_jac(
         self, points_in_cam: ArrayLike
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Mask]:
         """`img_from_point`, with its Jacobian.
 
         Returns:

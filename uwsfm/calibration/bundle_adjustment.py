@@ -1,0 +1,269 @@
+"""Housing calibration: one joint bundle adjustment of everything that is unknown.
+
+Rig poses, cam_from_rig, port normals and distances and the points move together on the
+reprojection error in true pixels. Staging (normals first, then distances) converges
+less often, and the nested scheme of Sedlazeck & Koch (BMVC 2011, fig. 5) reaches the
+same optimum a hundred times slower.
+"""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm.calibration.problem import (
+    CalibrateOptions,
+    CalibrateSummary,
+    CalibrationResult,
+    CameraCovariance,
+    Covariance,
+)
+from uwsfm.errors import InputError, UwsfmError
+from uwsfm.geometry.rays import finite_rows
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver.covariance import point_covariances, reduced_covariance
+from uwsfm.solver.layout import HELD, Layout, build_layout
+from uwsfm.solver.levenberg_marquardt import (
+    LengthPriors,
+    LevenbergMarquardtOptions,
+    LevenbergMarquardtResult,
+    Problem,
+    Report,
+    Stop,
+    minimize,
+)
+from uwsfm.solver.state import State, translation_arm
+
+# Median of the squared length of a 2-D standard normal vector.
+MEDIAN_CHI2_2 = 2.0 * float(np.log(2.0))
+
+# No image feature is better than this: exact data must not prune rounding errors.
+MIN_NOISE_PX = 0.01
+
+
+def calibrate(
+    scene: Scene, *, report: Report | None = None, **options
+) -> CalibrationResult:
+    """Refine the housing, the rig, the poses and the points of a scene.
+
+    Nothing changes in place. The first observed frame and the baseline lengths are
+    held: they fix place and scale.
+
+    Args:
+        scene: the start values, at least two frames.
+        report: called after every step with (iteration, cost).
+        **options: fields of `CalibrateOptions`.
+
+    Raises:
+        InputError: an unknown option, or a scene that cannot determine what is asked.
+        UwsfmError: the solver ended where nothing is physical.
+    """
+    try:
+        settings = CalibrateOptions(**options)
+    except TypeError as error:
+        raise InputError(f"calibrate: {error}") from None
+    _check(scene, settings)
+    began = time.perf_counter()
+    everything = np.ones(scene.num_observations, dtype=bool)
+    run = _Run(scene, settings, report)
+    solved = run.solve(State.from_scene(scene), everything, settings.loss)
+    iterations = solved.result.num_iterations
+    if settings.loss != "l2":
+        sigma = solved.robust_sigma()
+        keep = run.prune(solved.state, sigma)
+        solved = run.solve(solved.state, keep, "l2", sigma)
+        iterations += solved.result.num_iterations
+    summary = _summary(scene, solved, iterations, time.perf_counter() - began)
+    _check_ports(solved.state)
+    return CalibrationResult(
+        scene=solved.state.to_scene(scene),
+        inliers=solved.inliers,
+        summary=summary,
+        covariance=_covariance(solved, run.columns, summary.sigma_px),
+    )
+
+
+def _check(scene: Scene, settings: CalibrateOptions) -> None:
+    if len(scene.cameras) < 2:
+        raise InputError(
+            "scale is not determined: a scene with one camera has no baseline"
+        )
+    short = np.linalg.norm(scene.cam_from_rig[1:, 4:], axis=1) == 0.0
+    if np.any(short):
+        camera = int(np.nonzero(short)[0][0]) + 1
+        raise InputError(f"cam_from_rig[{camera}] has no translation: no baseline")
+    frames = len(np.unique(scene.frame_idx))
+    if frames < 2 and np.any(settings.refine_distances):
+        raise InputError(
+            f"the distance of a port cannot be estimated from {frames} frame: any "
+            "distance fits one stereo pair; add frames or set refine_distances=False"
+        )
+    finite = finite_rows(scene.points)[scene.point_idx]
+    if not np.all(finite):
+        point = int(scene.point_idx[~finite][0])
+        raise InputError(f"points[{point}] is not finite but has observations")
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """One finished solve, with its points back in the scene's numbering."""
+
+    state: State
+    inliers: NDArray[np.bool_]
+    layout: Layout
+    part: State
+    """The state of the points that took part only, as the layout numbers them."""
+    used: IndexArray
+    result: LevenbergMarquardtResult
+    problem: Problem
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        layout = self.layout
+        unknowns = layout.num_frame_cols + layout.num_border_cols + 3 * len(self.used)
+        return 2 * (len(layout.xy) - self.result.num_invalid) - unknowns
+
+    def robust_sigma(self) -> float:
+        """Noise of one coordinate from the median residual, px.
+
+        Residuals are smaller than the noise by the share of fitted parameters.
+        """
+        count = 2 * len(self.layout.xy)
+        median = float(np.nanmedian(self.result.squares))
+        share = max(self.degrees_of_freedom, 1) / count
+        return float(np.sqrt(median / MEDIAN_CHI2_2 / share))
+
+
+class _Run:
+    """The scene and settings that the solves of one calibration share."""
+
+    def __init__(
+        self, scene: Scene, settings: CalibrateOptions, report: Report | None
+    ) -> None:
+        self.scene = scene
+        self.settings = settings
+        self.report = report
+        self.columns = settings.border_columns(len(scene.cameras))
+
+    def solve(
+        self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float = 1.0
+    ) -> _Solved:
+        """Minimise over the observations kept whose points are seen twice."""
+        counts = np.bincount(self.scene.point_idx[keep], minlength=len(start.points))
+        inliers = keep & (counts[self.scene.point_idx] >= 2)
+        part, used = self.scene.select(inliers)
+        layout = build_layout(part, self.columns)
+        options = LevenbergMarquardtOptions(
+            loss=loss,
+            loss_scale_px=self.settings.loss_scale_px,
+            max_iterations=self.settings.max_iterations,
+            initial_damping=self.settings.initial_damping,
+        )
+        priors = self._priors(sigma_px)
+        part_state = replace(start, points=start.points[used])
+        result = minimize(layout, part_state, options, priors, self.report)
+        points = np.full_like(self.scene.points, np.nan)
+        points[used] = result.state.points
+        return _Solved(
+            state=replace(result.state, points=points),
+            inliers=inliers,
+            layout=layout,
+            part=result.state,
+            used=used,
+            result=result,
+            problem=Problem(layout, options, priors),
+        )
+
+    def prune(self, state: State, sigma_px: float) -> NDArray[np.bool_]:
+        """Mask (N,) of the observations within prune_sigma of their projections."""
+        limit = self.settings.prune_sigma * max(sigma_px, MIN_NOISE_PX)
+        _check_ports(state)
+        residuals = state.to_scene(self.scene).residuals()
+        return np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
+
+    def _priors(self, sigma_px: float) -> LengthPriors:
+        cols = self.columns[:, 5]
+        cameras = np.nonzero(cols != HELD)[0]
+        lengths = np.linalg.norm(self.scene.cam_from_rig[cameras, 4:], axis=1)
+        stddev = self.settings.baseline_stddev_m
+        weight = (sigma_px / stddev) ** 2 if len(cameras) else 0.0
+        return LengthPriors(
+            cols=cols[cameras],
+            cameras=cameras,
+            lengths=lengths,
+            weights=np.full(len(cameras), weight),
+        )
+
+
+def _check_ports(state: State) -> None:
+    for camera, row in enumerate(state.ports):
+        if row[3] < 0.0 or row[2] <= 0.0:
+            raise UwsfmError(
+                f"the port of camera {camera} came out at {1e3 * row[3]:.1f} mm with "
+                f"normal ({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the images do not "
+                "determine it; hold its distance, or add frames at other altitudes"
+            )
+
+
+def _summary(
+    scene: Scene, solved: _Solved, iterations: int, seconds: float
+) -> CalibrateSummary:
+    before = np.sum(scene.residuals() ** 2, axis=1)
+    squares = solved.result.squares[np.isfinite(solved.result.squares)]
+    freedom = solved.degrees_of_freedom
+    if freedom <= 0:
+        raise InputError(
+            f"{len(squares)} observations are too few for what is to be refined"
+        )
+    return CalibrateSummary(
+        num_frames=len(np.unique(solved.layout.cell_frame)),
+        num_points=len(solved.used),
+        num_observations=len(solved.layout.xy),
+        num_outliers=scene.num_observations - int(np.count_nonzero(solved.inliers)),
+        num_invalid=solved.result.num_invalid,
+        num_iterations=iterations,
+        converged=solved.result.stop is Stop.CONVERGED,
+        initial_rms_px=float(np.sqrt(np.nanmean(before))),
+        rms_px=float(np.sqrt(np.mean(squares))),
+        mean_error_px=float(np.mean(np.sqrt(squares))),
+        sigma_px=float(np.sqrt(np.sum(squares) / freedom)),
+        solve_s=seconds,
+    )
+
+
+def _covariance(solved: _Solved, columns: IndexArray, sigma_px: float) -> Covariance:
+    eqs = solved.problem.linearize(solved.part)
+    reduced = reduced_covariance(solved.layout, eqs)
+    variance = sigma_px**2
+    border = variance * reduced.border(solved.layout)
+    points = np.full((len(solved.state.points), 3, 3), np.nan)
+    points[solved.used] = variance * point_covariances(solved.layout, eqs, reduced)
+    return Covariance(
+        border=border,
+        border_cols=columns,
+        frames=variance * reduced.frames(solved.layout),
+        points=points,
+        cameras=tuple(
+            _camera_covariance(border, cols, pose)
+            for cols, pose in zip(columns, solved.state.cam_from_rig, strict=True)
+        ),
+        determined=reduced.determined,
+    )
+
+
+def _camera_covariance(
+    border: Array, cols: IndexArray, cam_from_rig: Array
+) -> CameraCovariance:
+    padded = np.zeros((len(border) + 1, len(border) + 1))
+    padded[:-1, :-1] = border  # HELD = -1 reads the zeros at the end
+    block = padded[np.ix_(cols, cols)]
+    arm = translation_arm(cam_from_rig[4:]).reshape(3, 3)
+    translation = np.einsum("ka,kl,la->a", arm, block[3:6, 3:6], arm)
+    return CameraCovariance(
+        normal_stddev_deg=float(np.degrees(np.sqrt(np.trace(block[6:8, 6:8])))),
+        distance_stddev_m=float(np.sqrt(block[8, 8])),
+        rotation_stddev_deg=float(np.degrees(np.sqrt(np.trace(block[:3, :3])))),
+        translation_stddev_m=tuple(np.sqrt(translation).tolist()),
+    )

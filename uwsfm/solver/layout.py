@@ -1,0 +1,77 @@
+"""The fixed structure of a bundle adjustment: sorted observations and columns.
+
+Observations are sorted by point, then frame, then camera. One point seen from one frame
+is a *cell*: only there do point and pose meet, whatever the number of cameras.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwsfm.errors import InputError
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import IndexArray, Scene
+
+HELD = -1
+
+
+class Layout(NamedTuple):
+    """Index arrays that kernels read; K cells, N observations, B border columns."""
+
+    xy: Array
+    """(N, 2) observations in sorted order."""
+    camera: IndexArray
+    """(N,) camera of each sorted observation."""
+    cell_start: IndexArray
+    """(K + 1,) first observation of each cell."""
+    cell_frame: IndexArray
+    """(K,) frame of each cell, rising within a point."""
+    point_start: IndexArray
+    """(P + 1,) first cell of each point."""
+    frame_col: IndexArray
+    """(F,) first of a frame's 6 columns in the reduced system, or HELD."""
+    border_col: IndexArray
+    """(C, BORDER_SIZE) column of each camera parameter in the border, or HELD."""
+    order: IndexArray
+    """(N,) index of each sorted observation in the scene."""
+
+    @property
+    def num_frame_cols(self) -> int:
+        return 6 * int(np.count_nonzero(self.frame_col != HELD))
+
+    @property
+    def num_border_cols(self) -> int:
+        return int(self.border_col.max(initial=-1)) + 1
+
+
+def build_layout(scene: Scene, border_col: IndexArray) -> Layout:
+    """Sort a scene's observations; the first observed frame is held (gauge).
+
+    Args:
+        scene: every point with an observation has at least two.
+        border_col: (C, BORDER_SIZE).
+
+    Raises:
+        InputError: the scene has no observations.
+    """
+    if scene.num_observations == 0:
+        raise InputError("the scene has no observations")
+    order = np.lexsort((scene.camera_idx, scene.frame_idx, scene.point_idx))
+    point, frame = scene.point_idx[order], scene.frame_idx[order]
+    new_cell = np.ones(len(order), dtype=bool)
+    new_cell[1:] = (np.diff(point) != 0) | (np.diff(frame) != 0)
+    starts = np.nonzero(new_cell)[0]
+    cells_of_point = np.bincount(point[starts], minlength=scene.num_points)
+    observed = np.unique(frame)
+    frame_col = np.full(scene.num_frames, HELD, dtype=np.int64)
+    frame_col[observed[1:]] = 6 * np.arange(len(observed) - 1)
+    return Layout(
+        xy=np.ascontiguousarray(scene.xy[order]),
+        camera=np.ascontiguousarray(scene.camera_idx[order]),
+        cell_start=np.append(starts, len(order)).astype(np.int64),
+        cell_frame=np.ascontiguousarray(frame[starts]),
+        point_start=np.concatenate([[0], np.cumsum(cells_of_point)]).astype(np.int64),
+        frame_col=frame_col,
+        border_col=np.ascontiguousarray(border_col, dtype=np.int64),
+        order=order.astype(np.int64),
+    )

@@ -1,0 +1,237 @@
+"""Levenberg-Marquardt on the reduced system, with the policy the measurements chose."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import scipy.linalg
+from threadpoolctl import threadpool_limits
+
+from uwsfm.errors import UwsfmError
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import IndexArray
+from uwsfm.solver import schur
+from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.losses import LOSS_CODES
+from uwsfm.solver.normal_equations import (
+    MIN_DIAGONAL,
+    NormalEquations,
+    empty_normal_equations,
+    linearize,
+    total_cost,
+)
+from uwsfm.solver.state import State
+
+# Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
+SINGLE_BLAS_BELOW = 1500
+
+
+class Stop(Enum):
+    """Why the iterations ended."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "iteration limit"
+    STALLED = "no step lowers the cost"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevenbergMarquardtOptions:
+    loss: str = "l2"
+    loss_scale_px: float = 3.0
+    max_iterations: int = 50
+    initial_damping: float = 1e-4
+    """1e-2 when the normals may be more than 30 degrees off."""
+    min_relative_decrease: float = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthPriors:
+    """Weak knowledge of the baseline lengths, as rows of the border."""
+
+    cols: IndexArray
+    """(L,) border columns of the lengths."""
+    cameras: IndexArray
+    """(L,) their cameras."""
+    lengths: Array
+    """(L,) metres"""
+    weights: Array
+    """(L,) (noise of an observation in px / standard deviation in metres) squared"""
+
+    def cost(self, state: State) -> float:
+        miss = state.baselines[self.cameras] - self.lengths
+        return 0.5 * float(np.sum(self.weights * miss**2))
+
+    def add_to(self, eqs: NormalEquations, state: State) -> None:
+        miss = state.baselines[self.cameras] - self.lengths
+        eqs.border[self.cols, self.cols] += self.weights
+        eqs.border_grad[self.cols] += self.weights * miss
+
+
+NO_PRIORS = LengthPriors(
+    cols=np.zeros(0, dtype=np.int64),
+    cameras=np.zeros(0, dtype=np.int64),
+    lengths=np.zeros(0),
+    weights=np.zeros(0),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevenbergMarquardtResult:
+    state: State
+    cost: float
+    """0.5 sum rho, priors included, px^2."""
+    squares: Array
+    """(N,) squared residuals in the layout's order, NaN where invalid."""
+    num_invalid: int
+    num_iterations: int
+    """Accepted and rejected steps."""
+    stop: Stop
+
+
+class Problem:
+    """A layout with its loss and priors: cost, linearisation and damped steps."""
+
+    def __init__(
+        self, layout: Layout, options: LevenbergMarquardtOptions, priors: LengthPriors
+    ) -> None:
+        self.layout = layout
+        self.priors = priors
+        self._loss = LOSS_CODES[options.loss]
+        self._scale = options.loss_scale_px
+        self._eqs = empty_normal_equations(layout)
+
+    def cost(self, state: State) -> tuple[float, int, Array]:
+        """Robust cost, number of invalid observations, squared residuals (N,)."""
+        squares = np.empty(len(self.layout.xy))
+        cost, invalid = total_cost(
+            self.layout, state.kernel_state(), self._loss, self._scale, squares
+        )
+        return cost + self.priors.cost(state), invalid, squares
+
+    def linearize(self, state: State) -> NormalEquations:
+        """Normal equations at a state; the arrays are used again by the next call."""
+        for block in self._eqs:
+            block[...] = 0.0
+        linearize(self.layout, state.kernel_state(), self._loss, self._scale, self._eqs)
+        self.priors.add_to(self._eqs, state)
+        return self._eqs
+
+    def step(self, eqs: NormalEquations, damping: float) -> tuple[Array, Array] | None:
+        """Steps of the reduced system (n,) and the points (P, 3); None if singular."""
+        matrix, right, inverses = schur.reduced_system(self.layout, eqs, damping)
+        if len(right) == 0:
+            step = right
+        else:
+            try:
+                factor = scipy.linalg.cho_factor(
+                    matrix, lower=True, overwrite_a=True, check_finite=True
+                )
+            except (scipy.linalg.LinAlgError, ValueError):
+                return None
+            step = scipy.linalg.cho_solve(factor, right)
+        points_step = np.empty_like(eqs.points_grad)
+        offset = self.layout.num_frame_cols
+        schur.substitute_back(self.layout, eqs, inverses, step, offset, points_step)
+        return step, points_step
+
+    def predicted_decrease(
+        self, eqs: NormalEquations, damping: float, step: Array, points_step: Array
+    ) -> float:
+        """How much the quadratic model falls: 0.5 delta^T (lambda D delta - g)."""
+        free = self.layout.frame_col != HELD
+        offset = self.layout.num_frame_cols
+        diagonals = np.concatenate(
+            [
+                np.einsum("faa->fa", eqs.frames[free]).ravel(),
+                np.einsum("aa->a", eqs.border),
+                np.einsum("paa->pa", eqs.points).ravel(),
+            ]
+        )
+        grads = [eqs.frames_grad[free].ravel(), eqs.border_grad]
+        gradient = np.concatenate([*grads, eqs.points_grad.ravel()])
+        delta = np.concatenate([step[:offset], step[offset:], points_step.ravel()])
+        scaled = damping * np.maximum(diagonals, MIN_DIAGONAL) * delta
+        return 0.5 * float(delta @ (scaled - gradient))
+
+
+Report = Callable[[int, float], None]
+
+
+def minimize(
+    layout: Layout,
+    start: State,
+    options: LevenbergMarquardtOptions,
+    priors: LengthPriors = NO_PRIORS,
+    report: Report | None = None,
+) -> LevenbergMarquardtResult:
+    """Minimise the robust reprojection error from a start.
+
+    Marquardt scaling by max(diagonal, 1e-6); the damping falls by
+    max(1/10, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure.
+
+    Raises:
+        UwsfmError: the start is so wrong that nothing can be projected.
+    """
+    size = layout.num_frame_cols + layout.num_border_cols
+    limit = 1 if size < SINGLE_BLAS_BELOW else None
+    with threadpool_limits(limit, user_api="blas"):
+        return _iterate(Problem(layout, options, priors), start, options, report)
+
+
+def _iterate(
+    problem: Problem,
+    state: State,
+    options: LevenbergMarquardtOptions,
+    report: Report | None,
+) -> LevenbergMarquardtResult:
+    cost, invalid, squares = problem.cost(state)
+    if invalid == len(squares):
+        raise UwsfmError(
+            "no observation can be projected from the start values: check the signs of "
+            "cam_from_rig and of the poses"
+        )
+    damping, growth = options.initial_damping, 2.0
+    # Below this all residuals are rounding errors (about 1e-11 px each).
+    floor = 1e-22 * len(squares)
+    eqs = problem.linearize(state)
+    stop, iterations = Stop.MAX_ITERATIONS, 0
+    for iterations in range(1, options.max_iterations + 1):
+        if cost <= floor:
+            stop = Stop.CONVERGED
+            break
+        steps = problem.step(eqs, damping)
+        decrease, predicted = -1.0, 1.0
+        if steps is not None:
+            trial = state.moved(problem.layout, *steps)
+            trial_cost, trial_invalid, trial_squares = problem.cost(trial)
+            decrease = cost - trial_cost
+            predicted = problem.predicted_decrease(eqs, damping, *steps)
+        if report is not None:
+            report(iterations, min(cost, cost - decrease))
+        if decrease > 0.0:
+            relative, gain = decrease / cost, decrease / max(predicted, 1e-300)
+            state, cost, invalid = trial, trial_cost, trial_invalid
+            squares = trial_squares
+            damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
+            growth = 2.0
+            if relative < options.min_relative_decrease:
+                stop = Stop.CONVERGED
+                break
+            eqs = problem.linearize(state)
+            continue
+        if steps is not None and abs(predicted) < options.min_relative_decrease * cost:
+            stop = Stop.CONVERGED
+            break
+        damping, growth = damping * growth, growth * 2.0
+        if damping > 1e12:
+            stop = Stop.STALLED
+            break
+    return LevenbergMarquardtResult(
+        state=state,
+        cost=cost,
+        squares=squares,
+        num_invalid=invalid,
+        num_iterations=iterations,
+        stop=stop,
+    )

@@ -1,0 +1,118 @@
+"""The values a bundle adjustment moves, and how a step moves them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwsfm.geometry import rigid3, unit_vector
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import FlatPort
+from uwsfm.residuals.reprojection import BORDER_SIZE
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.normal_equations import KernelState
+
+
+@dataclass(frozen=True)
+class State:
+    """Poses, ports and points. A port's distance may pass through negative values here:
+    the model is smooth there, a clamp at zero would make false stops."""
+
+    rig_from_world: Array
+    cam_from_rig: Array
+    ports: Array
+    """(C, PORT_SIZE)"""
+    points: Array
+    lenses: Array
+    """(C, LENS_SIZE)"""
+
+    @classmethod
+    def from_scene(cls, scene: Scene) -> "State":
+        return cls(
+            rig_from_world=scene.rig_from_world,
+            cam_from_rig=scene.cam_from_rig,
+            ports=np.array([port.params for port in scene.ports]),
+            points=scene.points,
+            lenses=np.array([camera.lens for camera in scene.cameras]),
+        )
+
+    def to_scene(self, scene: Scene) -> Scene:
+        """The scene with this state's values.
+
+        Raises:
+            InputError: a port is not physical (a negative distance, say).
+        """
+        cameras = tuple(
+            camera.with_port(FlatPort.from_params(row))
+            for camera, row in zip(scene.cameras, self.ports, strict=True)
+        )
+        return replace(
+            scene,
+            cameras=cameras,
+            cam_from_rig=self.cam_from_rig,
+            rig_from_world=self.rig_from_world,
+            points=self.points,
+        )
+
+    @property
+    def baselines(self) -> Array:
+        """(C,) lengths of the translations of cam_from_rig, metres."""
+        return np.linalg.norm(self.cam_from_rig[:, 4:], axis=1)
+
+    def kernel_state(self) -> KernelState:
+        return KernelState(
+            frames=rigid3.matrix_rows(self.rig_from_world),
+            cams=rigid3.matrix_rows(self.cam_from_rig),
+            arms=np.array([translation_arm(pose[4:]) for pose in self.cam_from_rig]),
+            lenses=self.lenses,
+            ports=self.ports,
+            points=self.points,
+        )
+
+    def moved(self, layout: Layout, step: Array, points_step: Array) -> "State":
+        """Apply a step of the reduced system (n,) and of the points (P, 3)."""
+        frames_step = np.zeros((len(self.rig_from_world), 6))
+        free = layout.frame_col != HELD
+        offset = layout.num_frame_cols
+        frames_step[free] = step[:offset].reshape(-1, 6)
+        cam_from_rig, ports = self.cam_from_rig.copy(), self.ports.copy()
+        for c, delta in enumerate(spread_border(layout.border_col, step[offset:])):
+            cam_from_rig[c] = _moved_camera(cam_from_rig[c], delta)
+            ports[c, :3] = unit_vector.plus(ports[c, :3], delta[6:8])
+            ports[c, 3] += delta[8]
+            ports[c, 7] += delta[9]
+        return replace(
+            self,
+            rig_from_world=rigid3.perturb(self.rig_from_world, frames_step),
+            cam_from_rig=cam_from_rig,
+            ports=ports,
+            points=self.points + points_step,
+        )
+
+
+def spread_border(border_col: IndexArray, step: Array) -> Array:
+    """Steps per camera (C, BORDER_SIZE), zero for what is held."""
+    padded = np.append(step, 0.0)  # HELD = -1 reads the zero at the end
+    return padded[border_col]
+
+
+def translation_arm(translation: Array) -> Array:
+    """Derivative of a translation by its direction (2) and its length (1), as (9,)."""
+    length = float(np.linalg.norm(translation))
+    if length == 0.0:
+        return np.zeros(9)
+    direction = translation / length
+    sideways = length * unit_vector.tangent_basis(direction).T
+    return np.concatenate([sideways.ravel(), direction])
+
+
+def _moved_camera(cam_from_rig: Array, delta: Array) -> Array:
+    """Turn the rotation by delta[:3], move the translation by delta[3:6]."""
+    assert delta.shape == (BORDER_SIZE,)
+    quat = rigid3.multiply_quats(rigid3.quat_from_rotvec(delta[:3]), cam_from_rig[:4])
+    length = float(np.linalg.norm(cam_from_rig[4:]))
+    translation = cam_from_rig[4:]
+    if length > 0.0:
+        direction = unit_vector.plus(translation / length, delta[3:5])
+        translation = (length + delta[5]) * direction
+    return np.concatenate([quat / np.linalg.norm(quat), translation])
