@@ -1,0 +1,225 @@
+"""`Model`, a refractive reconstruction with its image names, to COLMAP and back.
+
+The only place where COLMAP's identifiers meet our indices. Image, camera, rig and frame
+identifiers are written densely from 1 in the order of our arrays; the camera of index c
+is COLMAP's camera c + 1, and image ids run over cameras first, then frames.
+
+COLMAP cannot store ports. The cameras written are the lenses in air, the keypoints are
+the raw ones and the poses are those of the real projection centres: the housing in the
+sidecar file turns them into water rays.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig import Rig
+from uwsfm.scene import IndexArray, Scene
+
+RIG_ID = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A refractive reconstruction: its scene, and what the scene's indices stand for."""
+
+    rig: Rig
+    """Cameras, folders and ports, the refined ones where they were refined."""
+    scene: Scene
+    frame_names: tuple[str, ...]
+    """(F,) file names shared by the images of a frame."""
+    keypoints: tuple[tuple[Array, ...], ...]
+    """[camera][frame] -> (n, 2) all keypoints of an image, pixels."""
+    keypoint_idx: IndexArray
+    """(N,) which keypoint of its image each observation is."""
+    colors: NDArray[np.uint8]
+    """(P, 3) RGB"""
+
+    def image_name(self, camera: int, frame: int) -> str:
+        """Path of an image below the image directory."""
+        return f"{self.rig.cameras[camera].images}/{self.frame_names[frame]}"
+
+    def errors_px(self) -> Array:
+        """True reprojection error of each observation (N,), NaN if invalid."""
+        return np.linalg.norm(self.scene.residuals(), axis=1)
+
+
+def to_reconstruction(model: Model) -> pycolmap.Reconstruction:
+    """A COLMAP model with rig and frames, in-air intrinsics and raw keypoints.
+
+    The errors of the points are the true, refractive ones.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    scene = model.scene
+    _add_rig(reconstruction, model)
+    for frame in range(scene.num_frames):
+        _add_frame(reconstruction, model, frame)
+    errors = _mean_by_point(model.errors_px(), scene)
+    order = np.argsort(scene.point_idx, kind="stable")
+    starts = np.searchsorted(scene.point_idx[order], np.arange(scene.num_points + 1))
+    image_ids = 1 + scene.camera_idx * scene.num_frames + scene.frame_idx
+    for point in range(scene.num_points):
+        track = pycolmap.Track()
+        for row in order[starts[point] : starts[point + 1]]:
+            track.add_element(int(image_ids[row]), int(model.keypoint_idx[row]))
+        point_id = reconstruction.add_point3D(
+            scene.points[point], track, model.colors[point]
+        )
+        reconstruction.points3D[point_id].error = float(errors[point])
+    return reconstruction
+
+
+def _mean_by_point(values: Array, scene: Scene) -> Array:
+    count = np.bincount(scene.point_idx, minlength=scene.num_points)
+    total = np.bincount(scene.point_idx, values, minlength=scene.num_points)
+    return total / np.maximum(count, 1)
+
+
+def _sensor(camera: int) -> pycolmap.sensor_t:
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera + 1)
+
+
+def _add_rig(reconstruction: pycolmap.Reconstruction, model: Model) -> None:
+    rig = pycolmap.Rig(rig_id=RIG_ID)
+    for index, camera in enumerate(model.rig.cameras):
+        lens = camera.camera
+        reconstruction.add_camera(
+            pycolmap.Camera(
+                model=lens.model_name,
+                width=lens.width,
+                height=lens.height,
+                params=lens.params,
+                camera_id=index + 1,
+                has_prior_focal_length=True,
+            )
+        )
+        if index == 0:
+            rig.add_ref_sensor(_sensor(index))
+        else:
+            pose = model.scene.cam_from_rig[index]
+            rig.add_sensor(_sensor(index), _rigid(pose))
+    reconstruction.add_rig(rig)
+
+
+def _add_frame(
+    reconstruction: pycolmap.Reconstruction, model: Model, index: int
+) -> None:
+    scene = model.scene
+    frame = pycolmap.Frame(frame_id=index + 1, rig_id=RIG_ID)
+    frame.rig_from_world = _rigid(scene.rig_from_world[index])
+    images = []
+    for camera in range(len(scene.cameras)):
+        image = pycolmap.Image(
+            name=model.image_name(camera, index),
+            keypoints=model.keypoints[camera][index],
+            camera_id=camera + 1,
+            image_id=1 + camera * scene.num_frames + index,
+        )
+        image.frame_id = index + 1
+        images.append(image)
+        frame.add_data_id(pycolmap.data_t(_sensor(camera), image.image_id))
+    reconstruction.add_frame(frame)
+    for image in images:
+        reconstruction.add_image(image)
+    reconstruction.register_frame(index + 1)
+
+
+def _rigid(pose: Array) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
+
+
+def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Model:
+    """The `Model` of a COLMAP model written by `to_reconstruction` and its rig.
+
+    Raises:
+        InputError: an image is in no folder of the rig, or a frame is incomplete.
+    """
+    frames = sorted(reconstruction.reg_frame_ids())
+    images = _images_by_place(reconstruction, rig, frames)
+    prefix = len(rig.cameras[0].images) + 1
+    names = [images[0, f].name[prefix:] for f in range(len(frames))]
+    point_ids = sorted(reconstruction.points3D)
+    point_of = {point_id: index for index, point_id in enumerate(point_ids)}
+    place_of = {image.image_id: place for place, image in images.items()}
+    rows, pixels = [], []
+    for point_id in point_ids:
+        for element in reconstruction.points3D[point_id].track.elements:
+            camera, frame = place_of[element.image_id]
+            point2d = images[camera, frame].points2D[element.point2D_idx]
+            rows.append((camera, frame, point_of[point_id], element.point2D_idx))
+            pixels.append(point2d.xy)
+    table = np.array(rows, dtype=np.int64).reshape(-1, 4)
+    world = [reconstruction.frames[f].rig_from_world.params for f in frames]
+    cam_from_rig = [rigid3.IDENTITY]
+    colmap_rig = reconstruction.rigs[reconstruction.frames[frames[0]].rig_id]
+    for index in range(1, len(rig.cameras)):
+        sensor = images[index, 0].camera.sensor_id
+        cam_from_rig.append(colmap_rig.sensor_from_rig(sensor).params)
+    points = [reconstruction.points3D[i] for i in point_ids]
+    return Model(
+        rig=rig,
+        scene=Scene.from_arrays(
+            cameras=rig.refractive_cameras(),
+            cam_from_rig=np.array(cam_from_rig),
+            rig_from_world=np.array(world),
+            points=np.array([point.xyz for point in points]).reshape(-1, 3),
+            camera_idx=table[:, 0],
+            frame_idx=table[:, 1],
+            point_idx=table[:, 2],
+            xy=np.array(pixels).reshape(-1, 2),
+        ),
+        frame_names=tuple(names),
+        keypoints=tuple(
+            tuple(
+                np.array([p.xy for p in images[c, f].points2D]).reshape(-1, 2)
+                for f in range(len(frames))
+            )
+            for c in range(len(rig.cameras))
+        ),
+        keypoint_idx=table[:, 3],
+        colors=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
+    )
+
+
+def _images_by_place(
+    reconstruction: pycolmap.Reconstruction, rig: Rig, frames: list[int]
+) -> dict[tuple[int, int], pycolmap.Image]:
+    """Images by (camera, frame) index."""
+    images = {}
+    for index, frame_id in enumerate(frames):
+        for data_id in reconstruction.frames[frame_id].image_ids:
+            image = reconstruction.images[data_id.id]
+            cameras = [
+                c
+                for c, camera in enumerate(rig.cameras)
+                if image.name.startswith(f"{camera.images}/")
+            ]
+            if not cameras:
+                raise InputError(f"image {image.name} is in no folder of the rig")
+            images[cameras[0], index] = image
+        missing = [c for c in range(len(rig.cameras)) if (c, index) not in images]
+        if missing:
+            raise InputError(
+                f"frame {frame_id} has no image of camera {rig.cameras[missing[0]].name}"
+            )
+    return images
+
+
+def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model folder.
+
+    Raises:
+        InputError: there is none, or it cannot be read.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such COLMAP model folder")
+    try:
+        return pycolmap.Reconstruction(str(path))
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: not a COLMAP model: {error}") from None

@@ -1,0 +1,100 @@
+"""What a reconstruction leaves on disk, and how it is read back."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uwsfm._files import replaced_dir, replaced_file
+from uwsfm.colmap import (
+    Model,
+    from_reconstruction,
+    read_reconstruction,
+    to_reconstruction,
+)
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig_file import load_rig
+
+SPARSE, HOUSING, POINTS, SUMMARY = (
+    "sparse",
+    "housing.yaml",
+    "points.ply",
+    "summary.json",
+)
+
+
+def read_model(folder: str | Path) -> Model:
+    """Read the output folder of `uwsfm reconstruct`.
+
+    Raises:
+        InputError: the folder lacks the model or the housing, or they do not agree.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    reconstruction = read_reconstruction(folder / SPARSE)
+    return from_reconstruction(reconstruction, load_rig(folder / HOUSING))
+
+
+def export_colmap(model: Model, folder: str | Path) -> None:
+    """Write a COLMAP binary model: cameras, rigs, frames, images, points3D."""
+    reconstruction = to_reconstruction(model)
+    with replaced_dir(Path(folder)) as partial:
+        reconstruction.write_binary(str(partial))
+
+
+def export_ply(
+    model: Model, path: str | Path, points_cov: ArrayLike | None = None
+) -> None:
+    """Write the points as a binary PLY.
+
+    Properties: x y z (float, metres, world), red green blue (uchar), track_length
+    (int), reprojection_error_px (float, mean true error) and depth_stddev_m (float).
+
+    Args:
+        model: what to write.
+        path: the file.
+        points_cov: (P, 3, 3) covariances; without them there is no depth_stddev_m.
+    """
+    scene = model.scene
+    fields: list[tuple[str, str]] = [(axis, "<f4") for axis in "xyz"]
+    fields += [(color, "u1") for color in ("red", "green", "blue")]
+    fields += [("track_length", "<i4"), ("reprojection_error_px", "<f4")]
+    if points_cov is not None:
+        fields.append(("depth_stddev_m", "<f4"))
+    rows = np.zeros(scene.num_points, dtype=fields)
+    for index, axis in enumerate("xyz"):
+        rows[axis] = scene.points[:, index]
+    for index, color in enumerate(("red", "green", "blue")):
+        rows[color] = model.colors[:, index]
+    count = np.bincount(scene.point_idx, minlength=scene.num_points)
+    total = np.bincount(scene.point_idx, model.errors_px(), minlength=scene.num_points)
+    rows["track_length"] = count
+    rows["reprojection_error_px"] = total / np.maximum(count, 1)
+    if points_cov is not None:
+        rows["depth_stddev_m"] = depth_stddev(model, np.asarray(points_cov, float))
+    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += ["comment metres; made by uwsfm", f"element vertex {len(rows)}"]
+    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
+    with replaced_file(Path(path)) as partial:
+        partial.write_bytes(
+            "\n".join([*header, "end_header\n"]).encode("ascii") + rows.tobytes()
+        )
+
+
+def depth_stddev(model: Model, points_cov: Array) -> Array:
+    """Standard deviation of the points along the mean line of sight (P,), metres."""
+    scene = model.scene
+    cam_from_world = rigid3.compose(
+        scene.cam_from_rig[scene.camera_idx], scene.rig_from_world[scene.frame_idx]
+    )
+    centers = rigid3.inverse(cam_from_world)[:, 4:]
+    sight = scene.points[scene.point_idx] - centers
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    mean = np.zeros_like(scene.points)
+    np.add.at(mean, scene.point_idx, sight)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    return np.sqrt(np.einsum("pi,pij,pj->p", mean, points_cov, mean))

@@ -1,0 +1,42 @@
+"""housing.yaml: the refined rig, in the format of the rig file."""
+
+from pathlib import Path
+
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.colmap import Model
+from uwsfm.export.summary import distance_verdict
+from uwsfm.rig_file import dump_rig
+
+HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
+Standard deviations are one sigma; normals are unit vectors from camera to water."""
+
+
+def export_housing(
+    model: Model, path: str | Path, calibration: CalibrationResult | None = None
+) -> None:
+    """Write the rig of a model; with its calibration, standard deviations as comments."""
+    comments = {}
+    if calibration is not None:
+        comments = {
+            camera.name: _comments(model, calibration, index)
+            for index, camera in enumerate(model.rig.cameras)
+        }
+    dump_rig(model.rig, path, HEADER, comments)
+
+
+def _comments(model: Model, calibration: CalibrationResult, index: int) -> list[str]:
+    camera = model.rig.cameras[index]
+    cov = calibration.covariance.cameras[index]
+    distance = model.scene.ports[index].distance
+    lines = []
+    if camera.refine_normal:
+        lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
+    if camera.refine_distance:
+        verdict = distance_verdict(distance, cov, True)
+        lines.append(
+            f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} mm, "
+            f"{verdict} by the images"
+        )
+    if index > 0:
+        lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
+    return lines

@@ -1,0 +1,153 @@
+"""From the perspective start to the refractive optimum."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm._progress import Progress, silent
+from uwsfm.calibration.bundle_adjustment import calibrate
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.errors import UwsfmError
+from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
+from uwsfm.rig import Rig
+from uwsfm.scene import IndexArray, Scene
+
+# A point nearer to a camera than this many degrees of parallax has no depth.
+MIN_ANGLE_DEG = 1.5
+
+# The start's ports are guesses: an error this large is a wrong match all the same.
+MAX_START_ERROR_PX = 50.0
+
+# After the first solve the model is right, and an inlier has the error of a feature.
+MAX_ERROR_PX = 4.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refined:
+    """A refractive optimum over the observations that were kept."""
+
+    scene: Scene
+    kept: IndexArray
+    """(N',) index of each kept observation among those given."""
+    used: IndexArray
+    """(P',) index of each kept point among those given."""
+    calibration: CalibrationResult
+    """Of ``scene``: its masks and covariances use ``scene``'s indices."""
+    start_rms_px: float
+    """True error of the kept observations before the first solve, px."""
+
+
+def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined:
+    """Refractive bundle adjustment, twice: the second with all tracks tested again.
+
+    Points are triangulated from the water rays before each solve, so that a pinhole's
+    points are never kept; observations are tested by their true pixel errors.
+
+    Args:
+        scene: cameras with the ports' initial values, poses and tracks of the
+            perspective start; its points are not used.
+        rig: what to refine, and how well the baseline is known.
+        progress: called as the solver iterates.
+
+    Raises:
+        UwsfmError: nothing is left to adjust, or the result is not physical.
+    """
+    options = {
+        "refine_normals": tuple(camera.refine_normal for camera in rig.cameras),
+        "refine_distances": tuple(camera.refine_distance for camera in rig.cameras),
+        "baseline_stddev_m": rig.baseline_stddev_m,
+    }
+    steps = 0
+
+    def report(iteration: int, cost: float) -> None:
+        nonlocal steps
+        steps += 1
+        progress("refractive bundle adjustment", steps, None)
+
+    scene = retriangulated(scene)
+    keep = good_observations(scene, MAX_START_ERROR_PX)
+    start = scene
+    part, used = scene.select(_require(keep, scene))
+    first = calibrate(part, report=report, **options)
+    scene = retriangulated(_with_result(scene, first), first.inliers, keep)
+    keep = good_observations(scene, MAX_ERROR_PX)
+    part, used = scene.select(_require(keep, scene))
+    second = calibrate(part, report=report, **options)
+    kept = np.nonzero(keep)[0][second.inliers]
+    final, still = second.scene.select(second.inliers)
+    before = start.residuals()[kept]
+    return Refined(
+        scene=final,
+        kept=kept,
+        used=used[still],
+        calibration=_compact(second, final, still),
+        start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
+    )
+
+
+def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
+    """The whole scene with the cameras and poses of a result over a part of it."""
+    return replace(
+        scene,
+        cameras=result.scene.cameras,
+        cam_from_rig=result.scene.cam_from_rig,
+        rig_from_world=result.scene.rig_from_world,
+    )
+
+
+def retriangulated(
+    scene: Scene,
+    inliers: NDArray[np.bool_] | None = None,
+    among: NDArray[np.bool_] | None = None,
+) -> Scene:
+    """The scene with its points intersected from the water rays.
+
+    Args:
+        scene: its points are not used.
+        inliers: mask over the observations of ``among``; only those shape the points.
+        among: (N,) mask of observations; all by default.
+    """
+    origins, dirs = scene.water_rays()
+    use = np.ones(scene.num_observations, dtype=bool)
+    if inliers is not None:
+        use[:] = False
+        use[np.nonzero(among)[0] if among is not None else slice(None)] = inliers
+    dirs = np.where(use[:, None], dirs, np.nan)
+    points = triangulate_tracks(origins, dirs, scene.point_idx, scene.num_points)
+    return replace(scene, points=points)
+
+
+def good_observations(scene: Scene, max_error_px: float) -> NDArray[np.bool_]:
+    """Mask (N,) of observations near their points, whose points have depth."""
+    error = np.linalg.norm(scene.residuals(), axis=1)
+    near = finite_rows(scene.points)[scene.point_idx] & (error <= max_error_px)
+    _, dirs = scene.water_rays()
+    near &= finite_rows(dirs)
+    angles = np.zeros(scene.num_points)
+    angles[:] = max_ray_angles(dirs[near], scene.point_idx[near], scene.num_points)
+    near &= angles[scene.point_idx] >= np.radians(MIN_ANGLE_DEG)
+    counts = np.bincount(scene.point_idx[near], minlength=scene.num_points)
+    return near & (counts[scene.point_idx] >= 2)
+
+
+def _require(keep: NDArray[np.bool_], scene: Scene) -> NDArray[np.bool_]:
+    if np.count_nonzero(keep) < 100 or len(np.unique(scene.frame_idx[keep])) < 2:
+        raise UwsfmError(
+            f"only {np.count_nonzero(keep)} observations agree with the rig after "
+            "triangulation: check cam_from_rig and the ports in the rig file"
+        )
+    return keep
+
+
+def _compact(
+    result: CalibrationResult, scene: Scene, used: IndexArray
+) -> CalibrationResult:
+    """A result in the numbering of the scene that kept its inliers only."""
+    covariance = replace(result.covariance, points=result.covariance.points[used])
+    return replace(
+        result,
+        scene=scene,
+        inliers=np.ones(scene.num_observations, dtype=bool),
+        covariance=covariance,
+    )
