@@ -27,7 +27,7 @@ RIG_ID = 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A refractive reconstruction: its scene, and what the scene's indices stand for."""
+    """A refractive reconstruction: its scene and what the scene's indices mean."""
 
     rig: Rig
     """Cameras, folders and ports, the refined ones where they were refined."""
@@ -134,6 +134,12 @@ def _rigid(pose: Array) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
 
 
+def _params(pose: pycolmap.Rigid3d | None) -> Array:
+    if pose is None:
+        raise InputError("the COLMAP model has a frame or a rig sensor without a pose")
+    return np.array(pose.params)
+
+
 def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Model:
     """The `Model` of a COLMAP model written by `to_reconstruction` and its rig.
 
@@ -155,12 +161,12 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Mo
             rows.append((camera, frame, point_of[point_id], element.point2D_idx))
             pixels.append(point2d.xy)
     table = np.array(rows, dtype=np.int64).reshape(-1, 4)
-    world = [reconstruction.frames[f].rig_from_world.params for f in frames]
+    world = [_params(reconstruction.frames[f].rig_from_world) for f in frames]
     cam_from_rig = [rigid3.IDENTITY]
     colmap_rig = reconstruction.rigs[reconstruction.frames[frames[0]].rig_id]
     for index in range(1, len(rig.cameras)):
-        sensor = images[index, 0].camera.sensor_id
-        cam_from_rig.append(colmap_rig.sensor_from_rig(sensor).params)
+        lens = reconstruction.cameras[images[index, 0].camera_id]
+        cam_from_rig.append(_params(colmap_rig.sensor_from_rig(lens.sensor_id)))
     points = [reconstruction.points3D[i] for i in point_ids]
     return Model(
         rig=rig,
@@ -205,9 +211,8 @@ def _images_by_place(
             images[cameras[0], index] = image
         missing = [c for c in range(len(rig.cameras)) if (c, index) not in images]
         if missing:
-            raise InputError(
-                f"frame {frame_id} has no image of camera {rig.cameras[missing[0]].name}"
-            )
+            name = rig.cameras[missing[0]].name
+            raise InputError(f"frame {frame_id} has no image of camera {name}")
     return images
 
 

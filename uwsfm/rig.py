@@ -170,17 +170,18 @@ def camera_from_colmap(
 
     if model not in lens_models():
         raise InputError(
-            f"{model!r} is not a COLMAP camera model for a port; choose from "
+            f"model {model!r} is not one of COLMAP's for a port; choose from "
             f"{', '.join(lens_models())}"
         )
     camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     names = camera.params_info.split(", ")
     if len(params) != len(names):
         raise InputError(
-            f"{model} has {len(names)} parameters ({camera.params_info}), "
-            f"got {len(params)}"
+            f"{model} has {len(names)} params ({camera.params_info}), got {len(params)}"
         )
     for k in camera.focal_length_idxs():
+        if params[k] <= 0:
+            raise InputError(f"{names[k]} = {params[k]:g}; a focal length is positive")
         if params[k] < _MIN_FOCAL_PER_SIDE * max(width, height):
             raise InputError(
                 f"{names[k]} = {params[k]:g} is not the focal length in pixels of an "
@@ -234,7 +235,7 @@ def camera_from_opencv(
     if len(values) not in allowed:
         raise InputError(
             f"distortion of {'a fisheye' if fisheye else 'an OpenCV'} calibration has "
-            f"{' or '.join(map(str, allowed))} values, got {len(values)}"
+            f"{'4' if fisheye else '0, 4, 5 or 8'} values, got {len(values)}"
         )
     if fisheye:
         model = "OPENCV_FISHEYE"

@@ -14,7 +14,7 @@ Standard deviations are one sigma; normals are unit vectors from camera to water
 def export_housing(
     model: Model, path: str | Path, calibration: CalibrationResult | None = None
 ) -> None:
-    """Write the rig of a model; with its calibration, standard deviations as comments."""
+    """Write the rig of a model, with standard deviations as comments if known."""
     comments = {}
     if calibration is not None:
         comments = {

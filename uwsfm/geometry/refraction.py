@@ -60,7 +60,7 @@ def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
     Returns:
         q; NaN if no ray joins the point and the camera.
     """
-    if n_water < 1.0 or (n_glass < 1.0 and thick > 0.0):
+    if n_water < 1.0 or n_glass < 1.0:
         return _solve_bracketed(height, r2, dist, thick, n_glass, n_water)
     paraxial = dist + thick / n_glass + height / n_water
     if not paraxial > 0.0:
@@ -88,21 +88,23 @@ def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
 @kernel
 def _solve_bracketed(height, r2, dist, thick, n_glass, n_water):
     """The same root for any order of the indices, by Newton between brackets."""
-    u_max = math.inf
-    if n_water < 1.0:
-        u_max = n_water * n_water / (1.0 - n_water * n_water)
-    if n_glass < 1.0 and thick > 0.0:
-        u_max = min(u_max, n_glass * n_glass / (1.0 - n_glass * n_glass))
+    index = min(n_glass, n_water)
+    u_max = index * index / (1.0 - index * index)
     paraxial = dist + thick / n_glass + height / n_water
-    if r2 == 0.0 or not paraxial > 0.0:
+    if not paraxial > 0.0:
+        return math.nan
+    if r2 == 0.0:
         return 1.0 / paraxial
     low = 0.0
     high = math.sqrt(u_max / r2)
+    if thick == 0.0 and n_glass < n_water:
+        # No layer to travel sideways in: F stays finite at the critical angle.
+        if not high * (dist + height * slope(n_water, u_max)) > 1.0:
+            return math.nan
     q = min(1.0 / paraxial, 0.5 * high)
     for _ in range(4 * MAX_STEPS):
         u = q * q * r2
-        s_g = slope(n_glass, u) if thick > 0.0 else 0.0
-        s_w = slope(n_water, u)
+        s_g, s_w = slope(n_glass, u), slope(n_water, u)
         f = q * (dist + thick * s_g + height * s_w) - 1.0
         f1 = dist + thick * n_glass * n_glass * s_g**3
         f1 += height * n_water * n_water * s_w**3

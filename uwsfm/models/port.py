@@ -42,7 +42,10 @@ class FlatPort:
     n_air: float = 1.0
 
     def __post_init__(self) -> None:
-        normal = np.asarray(self.normal, dtype=np.float64)
+        try:
+            normal = np.asarray(self.normal, dtype=np.float64)
+        except (TypeError, ValueError):
+            normal = np.empty(0)
         if normal.shape != (3,) or not np.all(np.isfinite(normal)):
             raise InputError(
                 f"FlatPort normal must be 3 finite numbers, got {self.normal}"
@@ -57,7 +60,7 @@ class FlatPort:
                 "FlatPort normal must point from the camera to the water "
                 f"(positive z), got {tuple(normal.tolist())}: is its sign flipped?"
             )
-        normal /= length
+        normal = normal / length  # not in place: the array may be the caller's
         object.__setattr__(self, "normal", tuple(float(v) for v in normal))
         for name in ("distance", "thickness"):
             value = _finite(name, getattr(self, name))

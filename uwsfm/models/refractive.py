@@ -21,10 +21,12 @@ class InAirCamera(Protocol):
 
     width: int
     height: int
-    params: Array
 
     @property
     def model_name(self) -> str: ...
+
+    @property
+    def params(self) -> Array: ...
 
     def cam_ray_from_img(self, image_points: Array) -> Array: ...
 

@@ -1,0 +1,147 @@
+"""What the command line shows: progress bars and tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from uwsfm.evaluate import Comparison
+
+console = Console()
+errors = Console(stderr=True)
+
+
+class ProgressBars:
+    """Draws `uwsfm._progress.Progress` reports, one bar per step."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            SpinnerColumn(finished_text="[green]✓"),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=errors,
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> ProgressBars:
+        self._progress.start()
+        return self
+
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        if failure is None:
+            self._finish_others("")
+        self._progress.stop()
+
+    def __call__(self, step: str, done: int, total: int | None) -> None:
+        if step not in self._tasks:
+            self._finish_others(step)
+            self._tasks[step] = self._progress.add_task(step, total=total)
+        self._progress.update(self._tasks[step], completed=done, total=total)
+
+    def _finish_others(self, step: str) -> None:
+        """Steps run one after the other: a new one means that the last one is done."""
+        for name, task in self._tasks.items():
+            if name != step:
+                done = self._progress.tasks[task].completed
+                self._progress.update(task, completed=done, total=max(done, 1))
+
+
+def housing_table(summary: dict[str, Any]) -> Table:
+    """The refined housings, each number with its standard deviation."""
+    table = Table(title="Housing", title_justify="left")
+    for column in ("camera", "normal (x, y, z)", "± deg", "distance", "± mm", ""):
+        table.add_column(column, justify="left" if column == "camera" else "right")
+    for camera in summary["cameras"]:
+        table.add_row(
+            camera["name"],
+            _vector(camera["normal"]),
+            _number(camera["normal_stddev_deg"], "{:.3f}"),
+            f"{1e3 * camera['distance_m']:.2f} mm",
+            _number(camera["distance_stddev_m"], "{:.2f}", 1e3),
+            camera["distance_verdict"],
+        )
+    return table
+
+
+def result_table(summary: dict[str, Any]) -> Table:
+    """How much was reconstructed, and how well it fits."""
+    table = Table(title="Reconstruction", title_justify="left", show_header=False)
+    rms = summary["reprojection_rms_px"]
+    frames = f"{summary['num_registered_frames']} of {summary['num_frames']}"
+    table.add_row("frames registered", frames)
+    table.add_row("points", f"{summary['num_points']}")
+    table.add_row("observations", f"{summary['num_observations']}")
+    table.add_row("invalid observations", f"{summary['num_invalid']}")
+    table.add_row("true reprojection RMS before", f"{rms['before']:.3f} px")
+    table.add_row("true reprojection RMS after", f"{rms['after']:.3f} px")
+    return table
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Estimate, standard deviation and truth, side by side."""
+    table = Table(title="Estimate against truth", title_justify="left")
+    for column in ("", "estimate", "std. dev.", "truth", "error"):
+        table.add_column(column, justify="right" if column else "left")
+    for camera in comparison.cameras:
+        table.add_row(
+            f"{camera.name}: port normal",
+            _vector(camera.normal),
+            _number(camera.tilt_stddev_deg, "{:.3f} deg"),
+            _vector(camera.true_normal),
+            f"{camera.tilt_error_deg:.3f} deg",
+        )
+        table.add_row(
+            f"{camera.name}: port distance",
+            f"{1e3 * camera.distance_m:.2f} mm",
+            _number(camera.distance_stddev_m, "{:.2f} mm", 1e3),
+            f"{1e3 * camera.true_distance_m:.2f} mm",
+            f"{1e3 * camera.distance_error_m:+.2f} mm",
+        )
+    table.add_row(
+        "frames registered",
+        str(comparison.num_frames),
+        "",
+        str(comparison.num_true_frames),
+        "",
+    )
+    table.add_row(
+        "camera centres, first pose aligned",
+        "",
+        "",
+        "",
+        f"{1e3 * comparison.center_rms_m:.2f} mm RMS",
+    )
+    return table
+
+
+def timings_table(timings: dict[str, float]) -> Table:
+    """Where the time went."""
+    total = sum(timings.values())
+    table = Table(title="Time", title_justify="left", show_header=False)
+    for step, seconds in timings.items():
+        share = seconds / total if total else 0.0
+        table.add_row(step, f"{seconds:.1f} s", f"{share:.0%}")
+    table.add_row("total", f"{total:.1f} s", "")
+    return table
+
+
+def _vector(values: list[float] | tuple[float, ...]) -> str:
+    return " ".join(f"{value:+.4f}" for value in values)
+
+
+def _number(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "-" if value is None else form.format(scale * value)

@@ -1,0 +1,153 @@
+"""The keys of rig.yaml and what their values may be, as pydantic models."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
+
+from uwsfm.geometry.rigid3 import Array, from_rotmat
+from uwsfm.rig import (
+    camera_from_colmap,
+    camera_from_opencv,
+    checked_baseline,
+    checked_folder,
+    checked_index,
+    checked_normal,
+    checked_port_distance,
+    checked_rotation,
+    checked_text,
+    checked_thickness,
+    checked_unit,
+)
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_Pixels = Annotated[int, Field(ge=1, le=100_000)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Index = Annotated[_Number, AfterValidator(checked_index)]
+# YAML lists arrive as Python lists; strict mode would take nothing but tuples.
+_Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
+_Three = Field(strict=False, min_length=3, max_length=3)
+_Four = Field(strict=False, min_length=4, max_length=4)
+_Vector = Annotated[tuple[_Number, ...], _Three]
+_Quaternion = Annotated[tuple[_Number, ...], _Four, AfterValidator(checked_unit)]
+_Matrix = Annotated[tuple[_Vector, ...], _Three]
+
+
+class Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class WaterEntry(Entry):
+    refractive_index: _Index
+
+
+class PortEntry(Entry):
+    type: Literal["flat"]
+    normal: Annotated[_Vector, AfterValidator(checked_normal)]
+    distance_m: Annotated[_Number, AfterValidator(checked_port_distance)]
+    thickness_m: Annotated[_Number, AfterValidator(checked_thickness)]
+    glass_index: _Index
+    refine: Annotated[tuple[Literal["normal", "distance"], ...], Field(strict=False)]
+
+
+class ColmapLens(Entry):
+    model: str
+    width_px: _Pixels
+    height_px: _Pixels
+    params: _Numbers
+
+    def to_camera(self) -> pycolmap.Camera:
+        return camera_from_colmap(
+            self.model, self.width_px, self.height_px, self.params
+        )
+
+
+class OpenCvBlock(Entry):
+    width_px: _Pixels
+    height_px: _Pixels
+    camera_matrix: _Matrix
+    distortion: _Numbers
+    fisheye: bool = False
+    pixel_origin: Literal["opencv", "colmap"]
+
+
+class OpenCvLens(Entry):
+    opencv: OpenCvBlock
+
+    def to_camera(self) -> pycolmap.Camera:
+        block = self.opencv.model_dump()
+        size = block.pop("width_px"), block.pop("height_px")
+        return camera_from_opencv(*size, **block)
+
+
+class CamFromRig(Entry):
+    rotation_xyzw: _Quaternion | None = None
+    rotation_matrix: Annotated[_Matrix, AfterValidator(checked_rotation)] | None = None
+    translation_m: _Vector
+
+    @model_validator(mode="after")
+    def _has_one_rotation(self) -> CamFromRig:
+        if (self.rotation_xyzw is None) == (self.rotation_matrix is None):
+            raise ValueError("needs one of rotation_xyzw and rotation_matrix")
+        return self
+
+    def to_pose(self) -> Array:
+        """Row (7,)."""
+        if self.rotation_matrix is not None:
+            return from_rotmat(self.rotation_matrix, self.translation_m)
+        return np.array([*(self.rotation_xyzw or ()), *self.translation_m])
+
+
+def _lens_tag(value: Any) -> str:
+    # Tags show up in pydantic's key paths; the brackets mark them for removal.
+    return "(opencv)" if isinstance(value, dict) and "opencv" in value else "(colmap)"
+
+
+class CameraEntry(Entry):
+    name: Annotated[str, AfterValidator(checked_text)]
+    images: Annotated[str, AfterValidator(checked_folder)]
+    intrinsics: Annotated[
+        Annotated[ColmapLens, Tag("(colmap)")] | Annotated[OpenCvLens, Tag("(opencv)")],
+        Discriminator(_lens_tag),
+    ]
+    port: PortEntry
+    cam_from_rig: CamFromRig | None = None
+    baseline_m: Annotated[_Number, AfterValidator(checked_baseline)] | None = None
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _is_plausible(cls, lens: ColmapLens | OpenCvLens) -> Any:
+        lens.to_camera()
+        return lens
+
+
+class RigFile(Entry):
+    version: Literal[1]
+    water: WaterEntry
+    baseline_stddev_m: Annotated[_Number, Field(ge=0)] = 0.0
+    cameras: Annotated[tuple[CameraEntry, ...], Field(strict=False)]
+
+
+ENTRIES: dict[str, type[Entry]] = {
+    "": RigFile,
+    "water": WaterEntry,
+    "cameras": CameraEntry,
+    "(colmap)": ColmapLens,
+    "(opencv)": OpenCvLens,
+    "opencv": OpenCvBlock,
+    "port": PortEntry,
+    "cam_from_rig": CamFromRig,
+}
