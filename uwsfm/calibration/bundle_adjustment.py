@@ -81,7 +81,7 @@ def calibrate(
         scene=solved.state.to_scene(scene),
         inliers=solved.inliers,
         summary=summary,
-        covariance=_covariance(solved, run.columns, summary.sigma_px),
+        covariance=_covariance(run, solved, summary.sigma_px),
     )
 
 
@@ -100,6 +100,12 @@ def _check(scene: Scene, settings: CalibrateOptions) -> None:
             f"the distance of a port cannot be estimated from {frames} frame: any "
             "distance fits one stereo pair; add frames or set refine_distances=False"
         )
+    indices = {port.n_water for port in scene.ports}
+    if settings.refine_water_index and len(indices) > 1:
+        raise InputError(
+            "refine_water_index refines one index for all ports, but they start from "
+            f"n_water = {', '.join(str(index) for index in sorted(indices))}"
+        )
     finite = finite_rows(scene.points)[scene.point_idx]
     if not np.all(finite):
         point = int(scene.point_idx[~finite][0])
@@ -117,7 +123,6 @@ class _Solved:
     """The state of the points that took part only, as the layout numbers them."""
     used: IndexArray
     result: LevenbergMarquardtResult
-    problem: Problem
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -161,7 +166,7 @@ class _Run:
             max_iterations=self.settings.max_iterations,
             initial_damping=self.settings.initial_damping,
         )
-        priors = self._priors(sigma_px)
+        priors = self.priors(sigma_px)
         part_state = replace(start, points=start.points[used])
         result = minimize(layout, part_state, options, priors, self.report)
         points = np.full_like(self.scene.points, np.nan)
@@ -173,7 +178,6 @@ class _Run:
             part=result.state,
             used=used,
             result=result,
-            problem=Problem(layout, options, priors),
         )
 
     def prune(self, state: State, sigma_px: float) -> NDArray[np.bool_]:
@@ -183,7 +187,8 @@ class _Run:
         residuals = state.to_scene(self.scene).residuals()
         return np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
 
-    def _priors(self, sigma_px: float) -> LengthPriors:
+    def priors(self, sigma_px: float) -> LengthPriors:
+        """Priors on the baselines, weighed against observations of this noise."""
         cols = self.columns[:, 5]
         cameras = np.nonzero(cols != HELD)[0]
         lengths = np.linalg.norm(self.scene.cam_from_rig[cameras, 4:], axis=1)
@@ -233,8 +238,11 @@ def _summary(
     )
 
 
-def _covariance(solved: _Solved, columns: IndexArray, sigma_px: float) -> Covariance:
-    eqs = solved.problem.linearize(solved.part)
+def _covariance(run: _Run, solved: _Solved, sigma_px: float) -> Covariance:
+    # The solve weighed the priors against a guess of the noise; now it is known.
+    options, columns = LevenbergMarquardtOptions(loss="l2"), run.columns
+    problem = Problem(solved.layout, options, run.priors(sigma_px))
+    eqs = problem.linearize(solved.part)
     reduced = reduced_covariance(solved.layout, eqs)
     variance = sigma_px**2
     border = variance * reduced.border(solved.layout)

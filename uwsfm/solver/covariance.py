@@ -1,5 +1,6 @@
 """Posterior covariance of frames, border and points at an optimum."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +19,10 @@ SINGULAR = 1e-13
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedCovariance:
-    """Inverse of the reduced system (n, n), for unit noise, and the point inverses."""
+    """Inverse of the reduced system (n, n), for unit noise."""
 
     matrix: Array
     """(n, n) frames, then border; NaN everywhere if singular."""
-    inverses: Array
-    """(P, 3, 3) inverses of the point blocks, poses and border held."""
     determined: bool
     weakest: Array
     """(n,) the weakest direction in the scaled parameters; for messages."""
@@ -47,7 +46,7 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
 
     The observations' noise is taken as 1 px: multiply by the noise variance.
     """
-    lower, _, inverses = schur.reduced_system(layout, eqs, 0.0)
+    lower, _, _ = schur.reduced_system(layout, eqs, 0.0)
     matrix = lower + np.tril(lower, -1).T
     size = len(matrix)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
@@ -61,7 +60,6 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
         inverse = (scaled / values) @ scaled.T
     return ReducedCovariance(
         matrix=inverse,
-        inverses=inverses,
         determined=determined,
         weakest=vectors[:, 0] if size else np.zeros(0),
     )
@@ -87,16 +85,20 @@ def _coupling_of_point(layout, eqs, p, offset, cols, coupling):
 
 
 @kernel
-def _point_covariances(layout, eqs, inverses, matrix, offset, out):
-    """V^-1 + (C V^-1)^T S^-1 (C V^-1) of each point."""
+def _point_covariances(layout, eqs, matrix, offset, out):
+    """V^-1 + (C V^-1)^T S^-1 (C V^-1) of each point; NaN where V is singular."""
     num_border = len(eqs.border_grad)
+    inverse = np.empty((3, 3))
     for p in range(len(layout.point_start) - 1):
+        if not schur.invert_damped(eqs.points[p], 0.0, inverse):
+            out[p] = math.nan
+            continue
         cells = layout.point_start[p + 1] - layout.point_start[p]
         cols = np.empty(6 * cells + num_border, dtype=np.int64)
         coupling = np.empty((6 * cells + num_border, 3))
         rows = _coupling_of_point(layout, eqs, p, offset, cols, coupling)
-        reach = coupling[:rows] @ inverses[p]
-        out[p] = inverses[p]
+        reach = coupling[:rows] @ inverse
+        out[p] = inverse
         for i in range(rows):
             s0, s1, s2 = 0.0, 0.0, 0.0
             for j in range(rows):
@@ -118,8 +120,5 @@ def point_covariances(
     NaN for points that the observations do not determine.
     """
     out = np.empty_like(eqs.points)
-    _point_covariances(
-        layout, eqs, reduced.inverses, reduced.matrix, layout.num_frame_cols, out
-    )
-    out[np.einsum("pii->p", reduced.inverses) == 0.0] = np.nan
+    _point_covariances(layout, eqs, reduced.matrix, layout.num_frame_cols, out)
     return out

@@ -7,9 +7,13 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import MIN_DIAGONAL, NormalEquations
 
+# Damping of a point that its rays do not fix (seen twice in one image, or at infinity).
+# Held instead of free it would be a landmark, and promise what the data do not.
+LOOSE = 1e-8
+
 
 @kernel
-def _invert_damped(block, damping, inverse):
+def invert_damped(block, damping, inverse):
     """Inverse of a symmetric 3x3 with Marquardt damping; False if it is singular."""
     a = block[0, 0] + damping * max(block[0, 0], MIN_DIAGONAL)
     d = block[1, 1] + damping * max(block[1, 1], MIN_DIAGONAL)
@@ -17,7 +21,8 @@ def _invert_damped(block, damping, inverse):
     b, c, e = block[0, 1], block[0, 2], block[1, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * c00 + b * c01 + c * c02
-    if not det > 1e-18 * a * d * f:
+    # Rays 1e-7 rad apart; below, rounding decides (a point seen twice in one image).
+    if not det > 1e-14 * a * d * f:
         return False
     inverse[0, 0], inverse[1, 1] = c00 / det, (a * f - c * c) / det
     inverse[2, 2] = (a * d - b * b) / det
@@ -101,8 +106,7 @@ def eliminate_points(layout, eqs, damping, offset, inverses, matrix, right):
         layout, eqs: the linearised problem.
         damping: Marquardt's lambda.
         offset: number of frame columns.
-        inverses: (P, 3, 3), written: inverses of the damped point blocks; zero where
-            a point is not determined (its step is then zero).
+        inverses: (P, 3, 3), written: inverses of the damped point blocks.
         matrix, right: (n, n) and (n,), written.
     """
     matrix[:], right[:], inverses[:] = 0.0, 0.0, 0.0
@@ -111,8 +115,8 @@ def eliminate_points(layout, eqs, damping, offset, inverses, matrix, right):
     swept = np.empty((len(eqs.border_grad), 3))
     for p in range(len(layout.point_start) - 1):
         inverse = inverses[p]
-        if not _invert_damped(eqs.points[p], damping, inverse):
-            continue
+        if not invert_damped(eqs.points[p], damping, inverse):
+            invert_damped(eqs.points[p], LOOSE, inverse)
         _sweep_border(eqs, p, inverse, offset, swept, matrix, right)
         first, last = layout.point_start[p], layout.point_start[p + 1]
         for c in range(first, last):

@@ -1,0 +1,25 @@
+"""Fixtures shared by all tests."""
+
+from types import ModuleType
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from uwsfm.errors import MissingPackageError
+from uwsfm.simulate.raycasting import import_open3d
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Random numbers that depend on the test's name alone, not on the order run."""
+    return np.random.default_rng(crc32(request.node.name.encode()))
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """Open3D; where it cannot be imported, the test is skipped with the reason."""
+    try:
+        return import_open3d()
+    except MissingPackageError as error:
+        pytest.skip(str(error))

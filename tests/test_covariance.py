@@ -1,0 +1,124 @@
+"""Posterior covariance: the inverse of the dense normal matrix, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from dense import dense_system, small_scene
+
+from uwsfm import CalibrateOptions, calibrate
+from uwsfm.simulate import perturbed
+from uwsfm.solver import levenberg_marquardt as lm
+from uwsfm.solver.covariance import point_covariances, reduced_covariance
+from uwsfm.solver.layout import HELD, build_layout
+from uwsfm.solver.state import State
+
+
+def linearized(scene, options):
+    layout = build_layout(scene, options.border_columns(len(scene.cameras)))
+    problem = lm.Problem(layout, lm.LevenbergMarquardtOptions(), lm.NO_PRIORS)
+    return layout, problem.linearize(State.from_scene(scene))
+
+
+def repeat_observation(scene, row, shift_px):
+    """A new point, seen twice by the camera of an observation in the same image."""
+    again, point = [row, row], scene.point_idx[row]
+    return replace(
+        scene,
+        points=np.vstack([scene.points, scene.points[point]]),
+        camera_idx=np.append(scene.camera_idx, scene.camera_idx[again]),
+        frame_idx=np.append(scene.frame_idx, scene.frame_idx[again]),
+        point_idx=np.append(scene.point_idx, [scene.num_points] * 2),
+        xy=np.vstack([scene.xy, scene.xy[row], scene.xy[row] + shift_px]),
+    )
+
+
+def test_every_marginal_is_that_of_the_dense_normal_matrix():
+    scene = small_scene().truth
+    layout, eqs = linearized(scene, CalibrateOptions(refine_water_index=True))
+    reduced = reduced_covariance(layout, eqs)
+    assert reduced.determined
+
+    jac, _ = dense_system(scene, layout)
+    norms = np.linalg.norm(jac, axis=0)
+    dense = np.linalg.inv((jac / norms).T @ (jac / norms)) / np.outer(norms, norms)
+    offset = layout.num_frame_cols
+    size = offset + layout.num_border_cols
+
+    def assert_close(found, expected):
+        # The scaled normal matrix has condition 1e7 here: 1e-16 of it twice.
+        spread = np.sqrt(np.diag(expected))
+        error = np.abs(found - expected) / np.outer(spread, spread)
+        assert error.max() < 1e-7
+
+    assert_close(reduced.border(layout), dense[offset:size, offset:size])
+    for frame, column in enumerate(layout.frame_col):
+        block = reduced.frames(layout)[frame]
+        if column == HELD:
+            assert not block.any()
+        else:
+            inside = slice(column, column + 6)
+            assert_close(block, dense[inside, inside])
+    for p, block in enumerate(point_covariances(layout, eqs, reduced)):
+        inside = slice(size + 3 * p, size + 3 * p + 3)
+        assert_close(block, dense[inside, inside])
+
+
+def test_free_scale_is_found_to_be_undetermined():
+    """With glass of no thickness nothing but the baseline tells lengths apart."""
+    truth = small_scene().truth
+    cameras = tuple(
+        camera.with_port(replace(camera.port, thickness=0.0))
+        for camera in truth.cameras
+    )
+    scene = replace(truth, cameras=cameras)
+    free_length = CalibrateOptions(baseline_stddev_m=1.0)  # no prior is added here
+    for options, determined in ((free_length, False), (CalibrateOptions(), True)):
+        layout, eqs = linearized(scene, options)
+        reduced = reduced_covariance(layout, eqs)
+        assert reduced.determined is determined
+        assert np.isnan(reduced.border(layout)).all() != determined
+        points = point_covariances(layout, eqs, reduced)
+        assert np.isnan(points).all() != determined
+
+
+def test_a_point_seen_twice_in_one_image_tells_nothing():
+    """Its block is singular; held still, it would pass for a surveyed landmark."""
+    clean = perturbed(small_scene(6, 60, noise_px=0.3).scene)
+    expected = calibrate(clean, loss="l2")
+    doubled = repeat_observation(clean, row=10, shift_px=1e-6)
+    found = calibrate(doubled, loss="l2")
+    assert found.covariance.determined
+    noise = found.summary.sigma_px / expected.summary.sigma_px
+    # The point's loose end, 1e-8 of its block, is what is left of it.
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found.covariance.border)) / noise,
+        np.sqrt(np.diag(expected.covariance.border)),
+        rtol=1e-4,
+    )
+    assert np.isnan(found.covariance.points[-1]).all()
+    assert np.isfinite(found.covariance.points[:-1]).all()
+
+
+def test_stddevs_of_a_camera_are_read_from_the_right_columns():
+    truth = small_scene(noise_px=0.2).scene
+    options = {"refine_normals": (True, False), "refine_distances": (False, True)}
+    result = calibrate(truth, loss="l2", **options)
+    covariance = result.covariance
+    left, right = covariance.cameras
+    # Normal of the left; then rotation, direction and port distance of the right.
+    assert covariance.border_cols[0].tolist() == [HELD] * 6 + [0, 1, HELD, HELD]
+    expected = [2, 3, 4, 5, 6, HELD, HELD, HELD, 7, HELD]
+    assert covariance.border_cols[1].tolist() == expected
+    variance = np.diag(covariance.border)
+    assert left.normal_stddev_deg == pytest.approx(
+        np.degrees(np.sqrt(variance[0] + variance[1]))
+    )
+    assert left.distance_stddev_m == right.normal_stddev_deg == 0.0
+    assert right.distance_stddev_m == pytest.approx(np.sqrt(variance[7]))
+    assert right.rotation_stddev_deg == pytest.approx(
+        np.degrees(np.sqrt(variance[2:5].sum()))
+    )
+    # The length is held: the translation varies on a sphere, across itself.
+    total = np.sqrt(np.sum(np.square(right.translation_stddev_m)))
+    assert total == pytest.approx(0.2 * np.sqrt(variance[5:7].sum()))

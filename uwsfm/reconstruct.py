@@ -1,0 +1,198 @@
+"""The main job: images and a rig in, a metric refractive model out."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uwsfm._progress import Progress, silent
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.colmap import Model
+from uwsfm.errors import InputError
+from uwsfm.export.files import (
+    HOUSING,
+    POINTS,
+    SPARSE,
+    SUMMARY,
+    export_colmap,
+    export_ply,
+)
+from uwsfm.export.housing import export_housing
+from uwsfm.export.summary import errors_summary, housing_summary, versions, write_json
+from uwsfm.rig import Rig
+from uwsfm.rig_file import load_rig
+from uwsfm.scene import Scene
+from uwsfm.sfm.colors import point_colors
+from uwsfm.sfm.options import FeatureOptions, Matching, MatchOptions, StartOptions
+from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
+from uwsfm.sfm.refine import Refined, refine_scene
+from uwsfm.sfm.start import perspective_start
+
+WORK = "work"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReconstructResult:
+    """What `reconstruct` found; the same is on disk."""
+
+    model: Model
+    calibration: CalibrationResult
+    """Of ``model.scene``, with covariances."""
+    summary: dict[str, Any]
+    """summary.json"""
+
+
+def reconstruct(
+    rig: Rig | str | Path,
+    images: str | Path,
+    out: str | Path,
+    *,
+    clahe: bool = False,
+    masks: str | Path | None = None,
+    matching: Matching = "auto",
+    seed: int = 0,
+    num_threads: int = -1,
+    progress: Progress = silent,
+) -> ReconstructResult:
+    """Reconstruct a dive: features, perspective start, refractive optimum, files.
+
+    The steps before the refractive adjustment keep their results in ``out/work``: a run
+    that was stopped goes on where it was, and a run with other settings repeats what
+    they change.
+
+    Args:
+        rig: A rig, or the path of a rig file.
+        images: Folder that holds one folder of images per camera.
+        out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply`` and
+            ``summary.json``, each replaced as a whole.
+        clahe: Equalise contrast locally before the search for features.
+        masks: Folder of masks in COLMAP's naming.
+        matching: "exhaustive", "sequential", or "auto" by the number of frames.
+        seed: Of all random choices.
+        num_threads: -1 for all cores.
+        progress: Called with each long step.
+
+    Raises:
+        InputError: The rig file, the images or the output folder are not usable.
+        UwsfmError: The images could not be reconstructed; the message says why.
+    """
+    if not isinstance(rig, Rig):
+        rig = load_rig(rig)
+    for camera, refractive in zip(rig.cameras, rig.refractive_cameras(), strict=True):
+        try:
+            _ = refractive.lens
+        except InputError as error:
+            raise InputError(f"camera {camera.name!r}: {error}") from None
+    out = _output_folder(out)
+    options = StartOptions(
+        features=FeatureOptions(
+            clahe=clahe, mask_dir=None if masks is None else Path(masks)
+        ),
+        matching=MatchOptions(strategy=matching),
+        seed=seed,
+        num_threads=num_threads,
+    )
+    start = perspective_start(rig, Path(images), out / WORK, options, progress)
+    timings = dict(start.summary["timings_s"])
+    clock = time.perf_counter()
+    arrays = read_start(start)
+    refined = refine_scene(_start_scene(rig, start, arrays), rig, progress)
+    timings["refractive adjustment"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    model = _model(rig, Path(images), arrays, refined, progress)
+    export_colmap(model, out / SPARSE)
+    export_housing(model, out / HOUSING, refined.calibration)
+    export_ply(model, out / POINTS, refined.calibration.covariance.points)
+    timings["colours and export"] = time.perf_counter() - clock
+    summary = _summary(model, start, refined, timings)
+    write_json(summary, out / SUMMARY)
+    return ReconstructResult(
+        model=model, calibration=refined.calibration, summary=summary
+    )
+
+
+def _output_folder(out: str | Path) -> Path:
+    """Refuse what would overwrite somebody else's model."""
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file, not a folder for results")
+    if (out / SPARSE).exists() and not (out / WORK).exists():
+        raise InputError(
+            f"{out / SPARSE} exists and was not made by uwsfm: choose another folder"
+        )
+    return out
+
+
+def _start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:
+    return Scene.from_arrays(
+        cameras=rig.refractive_cameras(),
+        cam_from_rig=start.cam_from_rig,
+        rig_from_world=arrays.rig_from_world,
+        points=arrays.points,
+        camera_idx=arrays.camera_idx,
+        frame_idx=arrays.frame_idx,
+        point_idx=arrays.point_idx,
+        xy=arrays.xy,
+    )
+
+
+def _model(
+    rig: Rig, images: Path, arrays: StartArrays, refined: Refined, progress: Progress
+) -> Model:
+    scene = refined.scene
+    paths = [
+        [images / camera.images / name for name in arrays.frame_names]
+        for camera in rig.cameras
+    ]
+    return Model(
+        rig=rig.with_geometry(scene.cam_from_rig, scene.ports),
+        scene=scene,
+        frame_names=arrays.frame_names,
+        keypoints=arrays.keypoints,
+        keypoint_idx=arrays.keypoint_idx[refined.kept],
+        colors=point_colors(scene, paths, progress),
+    )
+
+
+def _summary(
+    model: Model,
+    start: PerspectiveStart,
+    refined: Refined,
+    timings: dict[str, float],
+) -> dict[str, Any]:
+    perspective = dict(start.summary)
+    warnings = perspective.pop("warnings") + _housing_warnings(model, refined)
+    del perspective["timings_s"]
+    found = errors_summary(model, refined.calibration)
+    after = found.pop("reprojection_rms_px")
+    return {
+        "num_frames": perspective.pop("num_frames"),
+        "unregistered_frames": perspective.pop("unregistered_frames"),
+        **found,
+        "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},
+        "cameras": housing_summary(model, refined.calibration),
+        "baseline_m": model.rig.baseline_m,
+        "baseline_stddev_m": model.rig.baseline_stddev_m,
+        "perspective_start": perspective,
+        "warnings": warnings,
+        "timings_s": timings,
+        "versions": versions(),
+    }
+
+
+def _housing_warnings(model: Model, refined: Refined) -> list[str]:
+    """What the images do not tell about the housings, one sentence each."""
+    warnings = []
+    for entry in housing_summary(model, refined.calibration):
+        verdict = entry["distance_verdict"]
+        if verdict in ("determined", "held"):
+            continue
+        stddev = entry["distance_stddev_m"]
+        known = "unknown" if stddev is None else f"{1e3 * stddev:.1f} mm"
+        warnings.append(
+            f"the port distance of {entry['name']} is {verdict} by these images "
+            f"(standard deviation {known}): add frames at other altitudes, or relief"
+        )
+    if not refined.calibration.summary.converged:
+        warnings.append("the refractive adjustment stopped before it converged")
+    return warnings

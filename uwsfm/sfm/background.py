@@ -1,0 +1,77 @@
+"""Long pycolmap calls: quiet, with progress, and stopped by Ctrl-C."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import pycolmap
+
+Result = TypeVar("Result")
+
+POLL_SECONDS = 0.2
+FATAL_ONLY = 3
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP's log off the terminal; what goes wrong is reported by exceptions."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = FATAL_ONLY
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+@contextmanager
+def opened(database_path: Path) -> Iterator[pycolmap.Database]:
+    """A database, without COLMAP's messages.
+
+    Never look into a database that COLMAP has open with Python's `sqlite3`: the two
+    libraries share a process and with it its file locks, and writes of COLMAP get
+    lost, silently (SQLite, "How to corrupt a database file", 2.2.1).
+    """
+    with quiet_colmap(), pycolmap.Database.open(database_path) as database:
+        yield database
+
+
+def run_watched(
+    call: Callable[[pycolmap.CancellationToken], Result], watch: Callable[[], None]
+) -> Result:
+    """Run ``call`` in a thread and ``watch`` in this one, every fifth of a second.
+
+    pycolmap releases the GIL but looks at no signals: an exception here (Ctrl-C, or
+    raised by ``watch``) cancels the call, waits for its end, and goes on.
+    """
+    token = pycolmap.CancellationToken()
+    with quiet_colmap(), ThreadPoolExecutor(max_workers=1) as pool:
+        future = pool.submit(call, token)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=POLL_SECONDS)
+                except StillRunning:
+                    if future.done():  # the call itself raised a TimeoutError
+                        raise
+                    watch()
+        except BaseException:
+            token.cancel()
+            raise
+
+
+def run_with_database(
+    database_path: Path,
+    call: Callable[[pycolmap.CancellationToken], Result],
+    watch: Callable[[pycolmap.Database], None],
+) -> Result:
+    """`run_watched` for a call that fills a database, which ``watch`` may count.
+
+    The connection is opened before the call begins, because opening one writes.
+    """
+    with opened(database_path) as database:
+        return run_watched(call, lambda: watch(database))

@@ -1,0 +1,154 @@
+"""Where the second camera is, when only its distance is known.
+
+As Sedlazeck & Koch (BMVC 2011): the images are reconstructed without a rig, with
+pinholes in which refraction is undone for far points (their 1.333 f, with Snell's law
+and the lens distortion kept); the relative poses of the frames agree on a rig, whose
+poses are then adjusted together with the radial distortion and the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from uwsfm._progress import Progress, silent
+from uwsfm.errors import UwsfmError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig import Rig
+from uwsfm.sfm.background import opened, quiet_colmap
+from uwsfm.sfm.images import Frames
+from uwsfm.sfm.mapper import map_images
+from uwsfm.sfm.mapping_database import (
+    image_id_of,
+    rig_config,
+    write_mapping_database,
+)
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
+
+MIN_FRAMES = 3
+MAX_SPREAD = 0.2
+"""Frames that differ more from the median, in radians or as a fraction of the
+baseline, are left out."""
+
+
+def rig_from_baseline(
+    features_path: Path,
+    work_dir: Path,
+    frames: Frames,
+    rig: Rig,
+    options: StartOptions,
+    progress: Progress = silent,
+) -> Array:
+    """Derive cam_from_rig (2, 7) of a stereo rig whose baseline length is known.
+
+    Args:
+        features_path: Database with keypoints and matches.
+        work_dir: For a database of its own.
+        frames: The images.
+        rig: Two cameras, `Rig.cam_from_rig` None.
+        options: As for the perspective start.
+        progress: Called with the steps "verifying" and "mapping".
+
+    Raises:
+        UwsfmError: too few frames show both cameras in one model.
+    """
+    cameras = rig.refractive_cameras()
+    pinholes = tuple(fit_virtual_pinhole(camera, None) for camera in cameras)
+    database_path = work_dir / "free.db"
+    write_mapping_database(
+        features_path,
+        database_path,
+        frames,
+        cameras,
+        pinholes,
+        None,
+        options,
+        progress,
+        model="RADIAL",
+    )
+    models = map_images(
+        database_path, frames, options, refine_distortion=True, progress=progress
+    )
+    relative = _relative_poses(models[0], frames)
+    if len(relative) < MIN_FRAMES:
+        raise UwsfmError(
+            f"only {len(relative)} frames show both cameras in one model, at least "
+            f"{MIN_FRAMES} are needed to derive cam_from_rig from baseline_m: give "
+            "cam_from_rig in rig.yaml"
+        )
+    average = robust_average(relative)
+    adjusted = _adjust(models[0], database_path, frames, average)
+    return with_baseline(adjusted, pinholes, rig.baseline_m)
+
+
+def _relative_poses(model: pycolmap.Reconstruction, frames: Frames) -> Array:
+    """Second camera from first (n, 7), of the frames with both."""
+    poses = []
+    for f in range(len(frames.names)):
+        ids = image_id_of(frames, 0, f), image_id_of(frames, 1, f)
+        if all(model.exists_image(i) and model.images[i].has_pose for i in ids):
+            first, second = (model.images[i].cam_from_world().params for i in ids)
+            poses.append(rigid3.compose(second, rigid3.inverse(first)))
+    return np.array(poses).reshape(-1, 7)
+
+
+def robust_average(poses: Array) -> Array:
+    """One pose (7,) for poses (n, 7) that should be equal; outliers are left out.
+
+    The middle one has the least median difference to all the others; the mean is taken
+    over those near it.
+    """
+    turn = rigid3.rotation_angle(
+        rigid3.compose(poses[:, None], rigid3.inverse(poses)[None])
+    )
+    shift = np.linalg.norm(poses[:, None, 4:] - poses[None, :, 4:], axis=-1)
+    length = np.median(np.linalg.norm(poses[:, 4:], axis=1))
+    difference = np.hypot(turn, shift / length)  # (n, n)
+    middle = int(np.argmin(np.median(difference, axis=1)))
+    near = poses[difference[middle] <= MAX_SPREAD]
+    rotation = rigid3.rotmat_from_quat(near[:, :4]).mean(axis=0)
+    return rigid3.from_rotmat(rotation, near[:, 4:].mean(axis=0))
+
+
+def _adjust(
+    model: pycolmap.Reconstruction, database_path: Path, frames: Frames, pose: Array
+) -> Array:
+    """Bundle adjustment of rig poses, relative pose, distortion and points (7,).
+
+    Everything is in the units of the model.
+    """
+    poses = np.stack([rigid3.IDENTITY, pose])
+    with quiet_colmap():
+        with opened(database_path) as database:
+            pycolmap.apply_rig_config([rig_config(frames, poses)], database, model)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = False
+        options.refine_extra_params = True
+        options.refine_sensor_from_rig = True
+        options.print_summary = False
+        pycolmap.bundle_adjustment(model, options)
+    (rig,) = (r for r in model.rigs.values() if r.num_sensors() == 2)
+    (sensor_from_rig,) = rig.non_ref_sensors.values()
+    return np.array(sensor_from_rig.params)
+
+
+def with_baseline(
+    pose: Array, pinholes: Sequence[VirtualPinhole], baseline_m: float
+) -> Array:
+    """Poses (2, 7) of the real cameras, from the virtual second one in any unit.
+
+    The virtual centres lie apart from the real ones by known lengths c, so the unit s
+    follows from |s t + c1 - R c0| = baseline.
+    """
+    fixed = pinholes[1].center_in_cam - rigid3.rotate(pose, pinholes[0].center_in_cam)
+    t = pose[4:]
+    a, b, c = t @ t, t @ fixed, fixed @ fixed - baseline_m**2
+    scale = (-b + np.sqrt(b * b - a * c)) / a
+    poses = np.stack([rigid3.IDENTITY, pose])
+    poses[1, 4:] = scale * t + fixed
+    return poses

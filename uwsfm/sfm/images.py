@@ -1,0 +1,176 @@
+"""Which images belong together, and whether they can be read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from uwsfm._progress import Progress, silent
+from uwsfm.errors import InputError
+from uwsfm.rig import Rig
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"})
+MIN_FRAMES = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """The frames of a dive: file names that every camera's folder holds."""
+
+    image_dir: Path
+    folders: tuple[str, ...]
+    """Sub-folder of each camera (C), in the order of the rig."""
+    names: tuple[str, ...]
+    """File name of each frame (F), in natural order: frame2 before frame10."""
+    unmatched: tuple[str, ...]
+    """Images left out, "folder/name": another camera has no image of that name."""
+
+    def image_name(self, camera_idx: int, frame_idx: int) -> str:
+        """An image as the COLMAP database knows it: "folder/name"."""
+        return f"{self.folders[camera_idx]}/{self.names[frame_idx]}"
+
+    def image_names(self) -> Iterator[str]:
+        """All images, frame by frame."""
+        for f in range(len(self.names)):
+            for c in range(len(self.folders)):
+                yield self.image_name(c, f)
+
+    def warnings(self) -> list[str]:
+        """What the user should know, one sentence each."""
+        if not self.unmatched:
+            return []
+        return [
+            f"{len(self.unmatched)} images were left out, for instance "
+            f"{self.unmatched[0]}: the other cameras have no image of that name"
+        ]
+
+    def fingerprint(self) -> list[Any]:
+        """Names, sizes and times of the images: what a change of them would change."""
+        rows: list[Any] = [list(self.folders)]
+        for name in self.image_names():
+            stat = (self.image_dir / name).stat()
+            rows.append([name, stat.st_size, stat.st_mtime_ns])
+        return rows
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Sorts "frame10" after "frame2"; the name itself breaks ties."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], name
+
+
+def find_frames(image_dir: Path, rig: Rig) -> Frames:
+    """Pair the images of the rig's folders by equal file name.
+
+    Raises:
+        InputError: a folder that is missing or holds no image, no common name, fewer
+            than two frames, or a file name that contains white space.
+    """
+    image_dir = Path(image_dir)
+    if not image_dir.is_dir():
+        raise InputError(f"image directory {image_dir} does not exist")
+    found = {c.images: _images_of(image_dir, c.images, c.name) for c in rig.cameras}
+    common = set.intersection(*found.values())
+    if not common:
+        first, second = list(found)[:2]
+        raise InputError(
+            f"no image name is common to the folders of {image_dir}: "
+            f"{first} has {min(found[first])}, {second} has {min(found[second])}; "
+            "images of one frame must have equal names"
+        )
+    if len(common) < MIN_FRAMES:
+        raise InputError(
+            f"only one frame ({common.pop()}) has an image of every camera in "
+            f"{image_dir}; a reconstruction needs at least {MIN_FRAMES}"
+        )
+    frames = Frames(
+        image_dir=image_dir,
+        folders=tuple(found),
+        names=tuple(sorted(common, key=natural_key)),
+        unmatched=tuple(
+            f"{folder}/{name}"
+            for folder, names in found.items()
+            for name in sorted(names - common, key=natural_key)
+        ),
+    )
+    for image_name in frames.image_names():
+        # COLMAP's lists of image pairs are separated by spaces.
+        if re.search(r"\s", image_name):
+            raise InputError(
+                f"image {image_dir / image_name}: its name contains white space; "
+                "rename it"
+            )
+    return frames
+
+
+def _images_of(image_dir: Path, folder: str, camera: str) -> set[str]:
+    path = image_dir / folder
+    if not path.is_dir():
+        raise InputError(f"folder {path} of camera {camera!r} does not exist")
+    names = {
+        item.name
+        for item in path.iterdir()
+        if item.suffix.lower() in SUFFIXES
+        and not item.name.startswith(".")
+        and item.is_file()
+    }
+    if not names:
+        raise InputError(f"folder {path} of camera {camera!r} holds no image")
+    return names
+
+
+def check_images(
+    frames: Frames, rig: Rig, *, num_threads: int = 2, progress: Progress = silent
+) -> None:
+    """Decode every image once, and compare its size with its camera's.
+
+    Raises:
+        InputError: an image that cannot be decoded, or of another size; names it.
+    """
+    sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
+    names = list(frames.image_names())
+
+    def check(image_name: str) -> str | None:
+        size = sizes[image_name.rpartition("/")[0]]
+        return image_fault(frames.image_dir / image_name, size)
+
+    with ThreadPoolExecutor(max_workers=max(1, num_threads)) as pool:
+        for done, fault in enumerate(pool.map(check, names), start=1):
+            if fault is not None:
+                pool.shutdown(cancel_futures=True)
+                raise InputError(fault)
+            progress("checking images", done, len(names))
+
+
+def image_fault(path: Path, size: tuple[int, int]) -> str | None:
+    """Why an image cannot be used by a camera of ``size`` (width, height), or None."""
+    image = read_gray(path)
+    if image is None:
+        return f"image {path} cannot be read: it is not an image, or it is damaged"
+    height, width = image.shape
+    if (width, height) != size:
+        return (
+            f"image {path} has {width} x {height} pixels, but the intrinsics of its "
+            f"camera are for {size[0]} x {size[1]}"
+        )
+    return None
+
+
+def read_gray(path: Path) -> Any:
+    """An image (height, width) uint8 as stored, or None if it cannot be decoded.
+
+    The orientation tag is ignored, as by COLMAP: intrinsics belong to the sensor.
+    """
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        return cv2.imdecode(data, flags)
+    except (OSError, cv2.error):  # cv2.error: an empty file
+        return None

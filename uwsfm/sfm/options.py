@@ -1,0 +1,95 @@
+"""How the perspective start is made. Defaults were measured on real tank images."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from uwsfm.errors import InputError
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions:
+    """How features are found."""
+
+    clahe: bool = False
+    """Equalise contrast locally first: for turbid water."""
+    mask_dir: Path | None = None
+    """Masks in COLMAP's naming: ``<mask_dir>/left/0001.jpg.png`` for the image
+    ``left/0001.jpg``; no features where a mask is black."""
+    peak_threshold: float = 0.005
+    """Least contrast. COLMAP's 0.0067 finds less than half as many features in water;
+    0.003 finds three times more, but noisier ones at three times the cost."""
+    max_num_features: int = 4096
+    """Per image; the largest are kept."""
+    max_upsampled_px: int = 2_000_000
+    """Images of at most so many pixels are searched at twice their size: that finds
+    more features, and places them better; larger images have enough without."""
+    max_image_size: int = 3200
+    """Longer images are reduced for the search; pixels refer to the full image."""
+
+    def __post_init__(self) -> None:
+        if self.mask_dir is not None and not Path(self.mask_dir).is_dir():
+            raise InputError(f"mask directory {self.mask_dir} does not exist")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchOptions:
+    """Which images are matched."""
+
+    strategy: Matching = "auto"
+    """Exhaustive compares all frames; sequential only neighbours, by file name."""
+    max_exhaustive_frames: int = 60
+    """Where "auto" changes to sequential: the cost grows with the square."""
+    overlap: int = 10
+    """Sequential: neighbours on each side; then those 16, 32, ... frames away, which
+    close the loops of a slow survey."""
+
+    def __post_init__(self) -> None:
+        if self.strategy not in get_args(Matching):
+            raise InputError(
+                f"matching must be one of {', '.join(get_args(Matching))}, "
+                f"got {self.strategy!r}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerificationOptions:
+    """Which matches are taken for geometry."""
+
+    max_error_px: float = 4.0
+    """In the virtual pinholes, where refraction is undone at the scene's distance."""
+    min_num_inliers: int = 15
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappingOptions:
+    """How the incremental mapper builds on verified matches."""
+
+    max_error_px: float = 6.0
+    """Observations beyond are dropped. Tolerant: what a pinhole explains badly may fit
+    the refractive model, which filters again."""
+    min_angle_deg: float = 1.5
+    """Between the rays of a point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartOptions:
+    """All options of the perspective start."""
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    matching: MatchOptions = field(default_factory=MatchOptions)
+    verification: VerificationOptions = field(default_factory=VerificationOptions)
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    seed: int = 0
+    num_threads: int = -1
+    """-1: all cores."""
+
+    @property
+    def threads(self) -> int:
+        """How many threads that is on this machine."""
+        return self.num_threads if self.num_threads > 0 else os.cpu_count() or 1

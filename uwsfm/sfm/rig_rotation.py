@@ -1,0 +1,141 @@
+"""Turn the cameras of a rig so that the rays of the same point meet.
+
+A port tilted by t degrees turns all rays by about t / 4, several pixels. Until the
+ports are calibrated, that turn can only be given to the cameras; without it a fixed rig
+does not fit its own images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig import Rig
+from uwsfm.sfm.rig_check import MIN_RIG_MATCHES, misfit_error
+from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
+
+MAX_MATCHES = 20_000
+PRIOR_DEG = 2.0
+NOISE = 1e-3
+"""Radians, less than a pixel: where the robust loss sets in."""
+MAX_TURN_DEG = 5.0
+"""A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
+MAX_REST = 5e-3
+"""Radians that no turn explains, median: a wrong direction of the baseline."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigRotation:
+    """A rig whose cameras were turned about their own centres."""
+
+    cam_from_rig: Array
+    """(C, 7); camera centres as before."""
+    turn_deg: Array
+    """(C,) by how much each camera was turned; the reference is not."""
+    misfit_before: float
+    """Median angle by which rays miss their epipolar plane, radians."""
+    misfit_after: float
+
+
+def correct_rotations(
+    rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]
+) -> RigRotation:
+    """Estimate small turns of the cameras from matches of the same frame.
+
+    Turns along the epipolar lines change depths, not misfits, and show only through
+    the perspective; a weak prior holds them where the images do not tell.
+
+    Args:
+        rig: Cameras and initial ports.
+        cam_from_rig: Poses (C, 7) to start from.
+        pairs: Matches of the same frame.
+
+    Raises:
+        InputError: the rig needs more than a port could explain.
+    """
+    used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
+    cameras = rig.refractive_cameras()
+    num_cameras = len(cameras)
+
+    def turned(delta: Array) -> Array:
+        tangent = np.zeros((num_cameras, 6))
+        tangent[1:, :3] = delta.reshape(-1, 3)
+        return rigid3.perturb(cam_from_rig, tangent)
+
+    def angles(poses: Array) -> Array:
+        rows = [
+            ray_pairs(
+                cameras[pair.camera_a],
+                cameras[pair.camera_b],
+                relative_pose(poses, pair.camera_a, pair.camera_b),
+                pair.xy_a,
+                pair.xy_b,
+            ).epipolar_angles()
+            for pair in used
+        ]
+        return np.nan_to_num(np.concatenate(rows), nan=0.0)
+
+    def residuals(delta: Array) -> Array:
+        prior = delta / np.radians(PRIOR_DEG)
+        return np.concatenate([angles(turned(delta)) / NOISE, prior])
+
+    start = np.zeros(3 * (num_cameras - 1))
+    solution = least_squares(residuals, start, loss="soft_l1", x_scale=np.radians(1.0))
+    poses = turned(solution.x)
+    turn_deg = np.zeros(num_cameras)
+    turn_deg[1:] = np.degrees(np.linalg.norm(solution.x.reshape(-1, 3), axis=1))
+    before = float(np.median(np.abs(angles(np.asarray(cam_from_rig)))))
+    after = float(np.median(np.abs(angles(poses))))
+    if turn_deg.max() > MAX_TURN_DEG or after > MAX_REST:
+        worst = int(turn_deg.argmax()) or used[0].camera_b
+        other = 0 if worst else used[0].camera_a
+        raise misfit_error(rig.cameras[other].name, rig.cameras[worst].name, before)
+    return RigRotation(
+        cam_from_rig=poses,
+        turn_deg=turn_deg,
+        misfit_before=before,
+        misfit_after=after,
+    )
+
+
+def _thinned(pair: PairMatches) -> PairMatches:
+    """At most `MAX_MATCHES` of the matches, evenly taken."""
+    step = -(-len(pair) // MAX_MATCHES)
+    return PairMatches(
+        camera_a=pair.camera_a,
+        camera_b=pair.camera_b,
+        frame_idx=pair.frame_idx[::step],
+        xy_a=pair.xy_a[::step],
+        xy_b=pair.xy_b[::step],
+    )
+
+
+def scene_depths(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> Array:
+    """How far away the scene is: 10th, 50th and 90th percentile of depth (C, 3).
+
+    Depth is the third coordinate in the camera's own frame, metres. A camera that
+    shares no view takes the percentiles of all points of the others.
+    """
+    cameras = rig.refractive_cameras()
+    seen: list[list[Array]] = [[] for _ in cameras]
+    for pair in pairs:
+        if len(pair) < MIN_RIG_MATCHES:
+            continue
+        a, b = pair.camera_a, pair.camera_b
+        b_from_a = relative_pose(cam_from_rig, a, b)
+        rays = ray_pairs(cameras[a], cameras[b], b_from_a, pair.xy_a, pair.xy_b)
+        points, in_front = rays.triangulate()
+        seen[a].append(points[in_front, 2])
+        seen[b].append(rigid3.transform(b_from_a, points[in_front])[:, 2])
+    everything = np.concatenate([depths for rows in seen for depths in rows])
+    return np.stack(
+        [
+            np.percentile(np.concatenate(rows) if rows else everything, [10, 50, 90])
+            for rows in seen
+        ]
+    )

@@ -1,0 +1,185 @@
+"""Matches between the cameras of one frame: what ties a rig to its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import closest_points, finite_rows
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.rig import Rig
+from uwsfm.scene import IndexArray
+from uwsfm.sfm.background import opened
+from uwsfm.sfm.images import Frames
+
+MAX_FRAMES = 100
+"""Frames looked at, evenly spread: the rig is the same in all of them."""
+MAX_EPIPOLAR_ANGLE = 8e-3
+"""Radians. Tolerant: rays of a flat port do not meet in one point, and a wrong port
+bends the epipolar lines by several pixels; yet few outliers come so near."""
+MIN_MATCHES = 15
+SEED = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairMatches:
+    """Pixels of points that two cameras of the rig saw in the same frame."""
+
+    camera_a: int
+    camera_b: int
+    frame_idx: IndexArray
+    """(N,)"""
+    xy_a: Array
+    """(N, 2)"""
+    xy_b: Array
+    """(N, 2)"""
+
+    def __len__(self) -> int:
+        return len(self.frame_idx)
+
+
+def read_same_frame_matches(
+    database_path: Path, frames: Frames, rig: Rig
+) -> list[PairMatches]:
+    """Matches of the same frame that agree with one epipolar geometry per frame.
+
+    Neither the rig's poses nor the distance of a port is used. The essential matrix is
+    robustly fitted to the directions of the water rays, in which the lens distortion
+    and nearly all of the refraction are undone.
+
+    Returns:
+        One entry per pair of cameras, those without a match included.
+    """
+    cameras = rig.refractive_cameras()
+    num_frames = len(frames.names)
+    chosen = np.unique(
+        np.linspace(0, num_frames - 1, min(num_frames, MAX_FRAMES)).astype(np.int64)
+    )
+    found: list[PairMatches] = []
+    with opened(database_path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        for a, b in combinations(range(len(cameras)), 2):
+            rows = []
+            for f in chosen.tolist():
+                id_a, id_b = ids[frames.image_name(a, f)], ids[frames.image_name(b, f)]
+                matches = database.read_matches(id_a, id_b)
+                if len(matches) < MIN_MATCHES:
+                    continue
+                xy_a = _keypoints(database, id_a)[matches[:, 0]]
+                xy_b = _keypoints(database, id_b)[matches[:, 1]]
+                good = _epipolar_inliers(cameras[a], cameras[b], xy_a, xy_b)
+                frame = np.full((int(good.sum()), 1), float(f))
+                rows.append(np.hstack([frame, xy_a[good], xy_b[good]]))
+            table = np.concatenate(rows) if rows else np.empty((0, 5))
+            found.append(
+                PairMatches(
+                    camera_a=a,
+                    camera_b=b,
+                    frame_idx=table[:, 0].astype(np.int64),
+                    xy_a=table[:, 1:3].copy(),
+                    xy_b=table[:, 3:5].copy(),
+                )
+            )
+    return found
+
+
+def _keypoints(database: pycolmap.Database, image_id: int) -> Array:
+    return database.read_keypoints(image_id)[:, :2].astype(np.float64)
+
+
+def _epipolar_inliers(
+    camera_a: RefractiveCamera, camera_b: RefractiveCamera, xy_a: Array, xy_b: Array
+) -> NDArray[np.bool_]:
+    """Mask (N,) of the matches that one essential matrix explains."""
+    image_a, image_b = (
+        _direction_image(camera_a, xy_a),
+        _direction_image(camera_b, xy_b),
+    )
+    inlier = finite_rows(image_a) & finite_rows(image_b)
+    if inlier.sum() < MIN_MATCHES:
+        return np.zeros(len(xy_a), dtype=np.bool_)
+    # Unit focal length: pixels are tangents, thresholds are angles.
+    unit = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0]
+    )
+    options = pycolmap.RANSACOptions()
+    options.max_error = MAX_EPIPOLAR_ANGLE
+    options.max_num_trials = 2000
+    options.random_seed = SEED
+    estimate = pycolmap.estimate_essential_matrix(
+        image_a[inlier], image_b[inlier], unit, unit, options
+    )
+    if estimate is None or estimate["num_inliers"] < MIN_MATCHES:
+        return np.zeros(len(xy_a), dtype=np.bool_)
+    inlier[inlier] = estimate["inlier_mask"]
+    return inlier
+
+
+def _direction_image(camera: RefractiveCamera, xy: Array) -> Array:
+    """Where the water rays of pixels point: x/z, y/z (N, 2); NaN without a ray."""
+    _, dirs = camera.ray_from_img(xy)
+    return dirs[:, :2] / dirs[:, 2:]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayPairs:
+    """Water rays of matches, both in the frame of the first camera."""
+
+    origins_a: Array
+    dirs_a: Array
+    origins_b: Array
+    dirs_b: Array
+
+    def epipolar_angles(self) -> Array:
+        """By how much each pair of rays misses coplanarity (N,), signed radians.
+
+        The Sampson error on the unit sphere: the least turn of both rays that makes
+        them and the line between their origins lie in one plane.
+        """
+        between = self.origins_b - self.origins_a
+        normal_a = np.cross(between, self.dirs_a)
+        normal_b = np.cross(between, self.dirs_b)
+        volume = np.einsum("ni,ni->n", normal_a, self.dirs_b)
+        square = np.sum(normal_a**2, axis=1) + np.sum(normal_b**2, axis=1)
+        return volume / np.sqrt(np.maximum(square, 1e-300))
+
+    def triangulate(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Midpoints (N, 3) in the first camera, and which lie in front of both."""
+        points, ranges, _ = closest_points(
+            self.origins_a, self.dirs_a, self.origins_b, self.dirs_b
+        )
+        with np.errstate(invalid="ignore"):
+            return points, np.all(ranges > 0.0, axis=1)
+
+
+def ray_pairs(
+    camera_a: RefractiveCamera,
+    camera_b: RefractiveCamera,
+    b_from_a: Array,
+    xy_a: Array,
+    xy_b: Array,
+) -> RayPairs:
+    """Water rays of matched pixels (N, 2) each, for a relative pose (7,)."""
+    origins_a, dirs_a = camera_a.ray_from_img(xy_a)
+    origins_b, dirs_b = camera_b.ray_from_img(xy_b)
+    a_from_b = rigid3.inverse(b_from_a)
+    return RayPairs(
+        origins_a=origins_a,
+        dirs_a=dirs_a,
+        origins_b=rigid3.transform(a_from_b, origins_b),
+        dirs_b=rigid3.rotate(a_from_b, dirs_b),
+    )
+
+
+def relative_pose(cam_from_rig: Array, camera_a: int, camera_b: int) -> Array:
+    """Pose b_from_a (7,) of two cameras of a rig (C, 7)."""
+    return rigid3.compose(
+        cam_from_rig[camera_b], rigid3.inverse(cam_from_rig[camera_a])
+    )

@@ -1,0 +1,306 @@
+"""From images to a perspective start: the front end of a reconstruction."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from uwsfm._files import replaced_file
+from uwsfm._progress import Progress, silent
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig import Rig
+from uwsfm.sfm.baseline import rig_from_baseline
+from uwsfm.sfm.features import extract_features, store_intrinsics
+from uwsfm.sfm.images import Frames, check_images, find_frames
+from uwsfm.sfm.mapper import map_images
+from uwsfm.sfm.mapping_database import write_mapping_database
+from uwsfm.sfm.matching import clear_matches, match_features
+from uwsfm.sfm.options import FeatureOptions, StartOptions
+from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
+from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
+from uwsfm.sfm.rig_check import check_rig
+from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
+from uwsfm.sfm.same_frame import read_same_frame_matches
+from uwsfm.sfm.steps import Steps, remove_database
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workspace:
+    """Where the steps keep their results."""
+
+    work_dir: Path
+
+    @property
+    def features(self) -> Path:
+        """Keypoints, descriptors and raw matches of the real images."""
+        return self.work_dir / "database.db"
+
+    @property
+    def enhanced(self) -> Path:
+        return self.work_dir / "clahe"
+
+    @property
+    def rig(self) -> Path:
+        """The rig derived from a baseline length."""
+        return self.work_dir / "rig.json"
+
+    @property
+    def mapping(self) -> Path:
+        """Virtual keypoints and verified matches."""
+        return self.work_dir / "mapping.db"
+
+    @property
+    def perspective(self) -> Path:
+        """The perspective model."""
+        return self.work_dir / "perspective"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FixedRig:
+    """The rig as the mapper holds it."""
+
+    rotation: RigRotation
+    depths: Array
+    pinholes: tuple[VirtualPinhole, ...]
+    num_matches: int
+
+
+def perspective_start(
+    rig: Rig,
+    image_dir: Path,
+    work_dir: Path,
+    options: StartOptions | None = None,
+    progress: Progress = silent,
+) -> PerspectiveStart:
+    """Register the images of a rig with pinholes that resemble its ports.
+
+    Steps whose inputs have not changed since they were finished in ``work_dir`` are
+    skipped, an interrupted one goes on.
+
+    Args:
+        rig: Lenses, initial ports, and poses or the length of the baseline.
+        image_dir: Holds one folder of images per camera.
+        work_dir: The workspace.
+        options: How.
+        progress: Called with each long step.
+
+    Raises:
+        InputError: images that are missing, unreadable or of the wrong size, or a rig
+            that contradicts them.
+        UwsfmError: too few matches, or nothing could be reconstructed.
+    """
+    options = options or StartOptions()
+    frames = find_frames(Path(image_dir), rig)
+    steps, space = Steps(Path(work_dir)), Workspace(work_dir=Path(work_dir))
+    key = _match_images(rig, frames, steps, space, options, progress)
+    geometry = [_rig_content(rig), asdict(options.verification), options.seed]
+    if rig.cam_from_rig is None:
+        key = steps.run(
+            "rig",
+            [key, geometry, asdict(options.mapping)],
+            lambda: _derive_rig(rig, frames, space, options, progress),
+            outputs=[space.rig],
+        )
+        poses = np.array(json.loads(space.rig.read_text(encoding="utf-8")))
+    else:
+        poses = np.asarray(rig.cam_from_rig)
+
+    @cache
+    def fixed() -> _FixedRig:
+        return _fix_rig(rig, poses, frames, space)
+
+    def verify() -> None:
+        write_mapping_database(
+            space.features,
+            space.mapping,
+            frames,
+            rig.refractive_cameras(),
+            fixed().pinholes,
+            fixed().rotation.cam_from_rig,
+            options,
+            progress,
+        )
+
+    key = steps.run("verification", [key, geometry], verify, outputs=[space.mapping])
+    steps.run(
+        "mapping",
+        [key, asdict(options.mapping)],
+        lambda: _map(frames, fixed(), space, options, progress),
+        outputs=[space.perspective],
+    )
+    start = load_start(space.perspective, space.features, frames)
+    start.summary["timings_s"] = steps.seconds()
+    return start
+
+
+def _match_images(
+    rig: Rig,
+    frames: Frames,
+    steps: Steps,
+    space: Workspace,
+    options: StartOptions,
+    progress: Progress,
+) -> str:
+    """Features and raw matches; neither depends on lenses, ports or poses."""
+    sizes = [(c.camera.width, c.camera.height) for c in rig.cameras]
+    inputs = [
+        pycolmap.__version__,
+        sizes,
+        frames.fingerprint(),
+        asdict(options.features),
+        _mask_content(frames, options.features),
+    ]
+
+    def extract() -> None:
+        check_images(frames, rig, num_threads=options.threads, progress=progress)
+        extract_features(
+            frames,
+            rig,
+            space.features,
+            options.features,
+            num_threads=options.threads,
+            progress=progress,
+        )
+
+    def forget() -> None:
+        remove_database(space.features)
+        shutil.rmtree(space.enhanced, ignore_errors=True)
+
+    key = steps.run("features", inputs, extract, outputs=[space.features], clear=forget)
+    store_intrinsics(frames, rig, space.features)
+    return steps.run(
+        "matches",
+        [key, asdict(options.matching)],
+        lambda: match_features(
+            frames,
+            space.features,
+            options.matching,
+            num_threads=options.threads,
+            progress=progress,
+        ),
+        outputs=[space.features],
+        clear=lambda: clear_matches(space.features),
+    )
+
+
+def _mask_content(frames: Frames, options: FeatureOptions) -> list[Any]:
+    if options.mask_dir is None:
+        return []
+    masks = (Path(options.mask_dir) / f"{name}.png" for name in frames.image_names())
+    found = [(mask, mask.stat()) for mask in masks if mask.exists()]
+    return [[str(mask), stat.st_size, stat.st_mtime_ns] for mask, stat in found]
+
+
+def _rig_content(rig: Rig) -> list[Any]:
+    """All of a rig that its geometry depends on, JSON."""
+    rows: list[Any] = [
+        [
+            item.images,
+            item.camera.model_name,
+            item.camera.width,
+            item.camera.height,
+            np.asarray(item.camera.params).tolist(),
+            item.port.params.tolist(),
+        ]
+        for item in rig.cameras
+    ]
+    poses = rig.cam_from_rig
+    return [rows, None if poses is None else poses.tolist(), rig.baseline_m]
+
+
+def _derive_rig(
+    rig: Rig,
+    frames: Frames,
+    space: Workspace,
+    options: StartOptions,
+    progress: Progress,
+) -> None:
+    poses = rig_from_baseline(
+        space.features, space.work_dir, frames, rig, options, progress
+    )
+    with replaced_file(space.rig) as partial:
+        partial.write_text(json.dumps(poses.tolist()), encoding="utf-8")
+
+
+def _fix_rig(rig: Rig, poses: Array, frames: Frames, space: Workspace) -> _FixedRig:
+    """Check the rig against its images, turn it to fit them, and fit the pinholes."""
+    pairs = read_same_frame_matches(space.features, frames, rig)
+    check_rig(rig, poses, pairs)
+    rotation = correct_rotations(rig, poses, pairs)
+    depths = scene_depths(rig, rotation.cam_from_rig, pairs)
+    pinholes = tuple(
+        fit_virtual_pinhole(camera, depths[c])
+        for c, camera in enumerate(rig.refractive_cameras())
+    )
+    return _FixedRig(
+        rotation=rotation,
+        depths=depths,
+        pinholes=pinholes,
+        num_matches=sum(len(pair) for pair in pairs),
+    )
+
+
+def _map(
+    frames: Frames,
+    fixed: _FixedRig,
+    space: Workspace,
+    options: StartOptions,
+    progress: Progress,
+) -> None:
+    models = map_images(space.mapping, frames, options, progress=progress)
+    write_start(
+        space.perspective,
+        models[0],
+        fixed.rotation.cam_from_rig,
+        fixed.pinholes,
+        fixed.depths,
+        _summary(frames, fixed, models),
+    )
+
+
+def _summary(
+    frames: Frames, fixed: _FixedRig, models: Sequence[pycolmap.Reconstruction]
+) -> dict[str, Any]:
+    best = models[0]
+    registered = {best.images[i].name.rpartition("/")[2] for i in best.reg_image_ids()}
+    missing = [name for name in frames.names if name not in registered]
+    others = [model.num_reg_frames() for model in models[1:]]
+    warnings = frames.warnings()
+    if missing:
+        warnings.append(
+            f"{len(missing)} of {len(frames.names)} frames could not be registered: "
+            f"{', '.join(missing[:10])}{' ...' if len(missing) > 10 else ''}"
+        )
+    if others:
+        warnings.append(
+            f"{len(others)} smaller models were left out, of "
+            f"{', '.join(str(size) for size in others[:10])} frames"
+        )
+    focal = float(np.mean([pinhole.focal_px for pinhole in fixed.pinholes]))
+    return {
+        "num_frames": len(frames.names),
+        "num_registered_frames": best.num_reg_frames(),
+        "unregistered_frames": missing,
+        "other_model_frames": others,
+        "num_points": best.num_points3D(),
+        "num_observations": best.compute_num_observations(),
+        "mean_error_px": best.compute_mean_reprojection_error(),
+        "num_same_frame_matches": fixed.num_matches,
+        "depth_percentiles_m": fixed.depths.tolist(),
+        "rig_turn_deg": fixed.rotation.turn_deg.tolist(),
+        "same_frame_misfit_px": {
+            "before_turn": focal * fixed.rotation.misfit_before,
+            "after_turn": focal * fixed.rotation.misfit_after,
+        },
+        "pinhole_rms_px": [pinhole.rms_px for pinhole in fixed.pinholes],
+        "pinhole_max_px": [pinhole.max_px for pinhole in fixed.pinholes],
+        "warnings": warnings,
+    }

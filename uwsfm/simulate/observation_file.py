@@ -1,0 +1,91 @@
+"""Simulated observations in one .npz file, readable with numpy alone."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from uwsfm._files import replaced_file
+from uwsfm.errors import InputError
+from uwsfm.models.port import FlatPort
+from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.scene import Scene
+from uwsfm.simulate.observations import SimulatedScene
+
+ARRAYS = {
+    "camera_model": "(C,) COLMAP model names of the in-air lenses",
+    "camera_size": "(C, 2) width and height, pixels",
+    "camera_params": "(C, K) in-air intrinsics, padded with NaN",
+    "port_params": "(C, 8) true [Nx, Ny, Nz, distance, thickness, n_a, n_g, n_w]",
+    "cam_from_rig": "(C, 7) true poses [qx, qy, qz, qw, tx, ty, tz]",
+    "rig_from_world": "(F, 7) true poses",
+    "points": "(P, 3) true points, metres",
+    "camera_idx": "(N,) of each observation",
+    "frame_idx": "(N,)",
+    "point_idx": "(N,)",
+    "xy": "(N, 2) observed pixels; the centre of the first pixel is (0.5, 0.5)",
+    "true_xy": "(N, 2) exact projections",
+    "is_outlier": "(N,)",
+}
+"""Names and meaning of the arrays in the file."""
+
+
+def write_observations(simulated: SimulatedScene, path: Path) -> None:
+    """Write the arrays of `ARRAYS`, replacing the file as a whole."""
+    truth = simulated.truth
+    lenses = [camera.camera for camera in truth.cameras]
+    params = np.full((len(lenses), max(len(lens.params) for lens in lenses)), np.nan)
+    for row, lens in zip(params, lenses, strict=True):
+        row[: len(lens.params)] = lens.params
+    with replaced_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            camera_model=np.array([lens.model_name for lens in lenses]),
+            camera_size=np.array([[lens.width, lens.height] for lens in lenses]),
+            camera_params=params,
+            port_params=np.stack([port.params for port in truth.ports]),
+            cam_from_rig=truth.cam_from_rig,
+            rig_from_world=truth.rig_from_world,
+            points=truth.points,
+            camera_idx=truth.camera_idx,
+            frame_idx=truth.frame_idx,
+            point_idx=truth.point_idx,
+            xy=simulated.scene.xy,
+            true_xy=truth.xy,
+            is_outlier=simulated.is_outlier,
+        )
+
+
+def read_observations(path: Path) -> SimulatedScene:
+    """Read what `write_observations` wrote.
+
+    Raises:
+        InputError: the file is not there, or not such a file.
+    """
+    try:
+        with np.load(path) as file:
+            data = {name: file[name] for name in ARRAYS}
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(
+            f"{path}: not a file of simulated observations: {error}"
+        ) from None
+    cameras = [
+        RefractiveCamera(
+            pycolmap.Camera(
+                model=str(model),
+                width=int(size[0]),
+                height=int(size[1]),
+                params=params[np.isfinite(params)],
+            ),
+            FlatPort.from_params(port),
+        )
+        for model, size, params, port in zip(
+            *(data[name] for name in list(ARRAYS)[:4]), strict=True
+        )
+    ]
+    shared = {name: data[name] for name in list(ARRAYS)[4:10]}
+    return SimulatedScene(
+        scene=Scene.from_arrays(cameras=cameras, xy=data["xy"], **shared),
+        truth=Scene.from_arrays(cameras=cameras, xy=data["true_xy"], **shared),
+        is_outlier=data["is_outlier"],
+    )
