@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from uwsfm.errors import MissingPackageError
-from uwsfm.simulate.raycasting import import_open3d
 
 
 @pytest.fixture
@@ -19,6 +18,8 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 @pytest.fixture(scope="session")
 def open3d() -> ModuleType:
     """Open3D; where it cannot be imported, the test is skipped with the reason."""
+    from uwsfm.simulate.raycasting import import_open3d
+
     try:
         return import_open3d()
     except MissingPackageError as error:

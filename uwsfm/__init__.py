@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from uwsfm.calibration.bundle_adjustment import calibrate
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+    from uwsfm.colmap import Model
     from uwsfm.errors import InputError, UwsfmError
+    from uwsfm.export.files import export_colmap, export_ply, read_model
+    from uwsfm.export.housing import export_housing
     from uwsfm.models.port import FlatPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
+    from uwsfm.reconstruct import reconstruct
+    from uwsfm.rig import Rig
+    from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
 
 __version__ = metadata.version("uwsfm")
@@ -24,12 +30,20 @@ _HOMES = {
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
     "FlatPort": "uwsfm.models.port",
+    "Model": "uwsfm.colmap",
+    "Rig": "uwsfm.rig",
     "InputError": "uwsfm.errors",
     "RefractiveCamera": "uwsfm.models.refractive",
     "Scene": "uwsfm.scene",
     "Status": "uwsfm.models.status",
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
+    "export_colmap": "uwsfm.export.files",
+    "export_housing": "uwsfm.export.housing",
+    "export_ply": "uwsfm.export.files",
+    "load_rig": "uwsfm.rig_file",
+    "read_model": "uwsfm.export.files",
+    "reconstruct": "uwsfm.reconstruct",
 }
 
 __all__ = [
@@ -37,11 +51,19 @@ __all__ = [
     "CalibrationResult",
     "FlatPort",
     "InputError",
+    "Model",
     "RefractiveCamera",
+    "Rig",
     "Scene",
     "Status",
     "UwsfmError",
     "calibrate",
+    "export_colmap",
+    "export_housing",
+    "export_ply",
+    "load_rig",
+    "read_model",
+    "reconstruct",
 ]
 
 

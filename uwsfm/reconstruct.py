@@ -124,9 +124,12 @@ def _output_folder(out: str | Path) -> Path:
 
 
 def _start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:
+    placement = start.cam_from_rig
+    if rig.cam_from_rig is not None and not rig.refine_cam_from_rig:
+        placement = rig.cam_from_rig
     return Scene.from_arrays(
         cameras=rig.refractive_cameras(),
-        cam_from_rig=start.cam_from_rig,
+        cam_from_rig=placement,
         rig_from_world=arrays.rig_from_world,
         points=arrays.points,
         camera_idx=arrays.camera_idx,
@@ -186,6 +189,13 @@ def _housing_warnings(model: Model, refined: Refined) -> list[str]:
     for entry in housing_summary(model, refined.calibration):
         verdict = entry["distance_verdict"]
         if verdict in ("determined", "held"):
+            continue
+        if verdict == "ran into zero":
+            warnings.append(
+                f"the images put the port of {entry['name']} behind its camera, so its "
+                "distance was held at zero: they contradict the lens calibrated in air "
+                "(is it valid up to the image corners?) or the water index"
+            )
             continue
         stddev = entry["distance_stddev_m"]
         known = "unknown" if stddev is None else f"{1e3 * stddev:.1f} mm"

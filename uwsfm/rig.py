@@ -41,6 +41,9 @@ class RigCamera:
     """In the camera frame; the initial value of whatever is refined."""
     refine_normal: bool
     refine_distance: bool
+    valid_radius_px: float | None = None
+    """How far from the principal point the calibration in air reached; features beyond
+    it do not take part. None: the whole image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,6 +62,9 @@ class Rig:
     """Length of the second camera's translation: the only source of scale."""
     baseline_stddev_m: float
     """Standard deviation of the baseline; 0 holds it exactly."""
+    refine_cam_from_rig: bool = True
+    """Whether the images may turn the cameras against each other; False trusts the
+    placement given, which must then be known."""
 
     def __post_init__(self) -> None:
         self._check_cameras()
@@ -75,6 +81,11 @@ class Rig:
             raise InputError(
                 "cameras: a baseline length alone describes a rig of two cameras, "
                 f"this one has {len(self.cameras)}"
+            )
+        elif not self.refine_cam_from_rig:
+            raise InputError(
+                "refine_cam_from_rig: a baseline length alone has to be refined; give "
+                "cam_from_rig to hold it"
             )
 
     def _check_cameras(self) -> None:

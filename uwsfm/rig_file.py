@@ -114,6 +114,7 @@ def _to_rig(file: RigFile) -> Rig:
         cam_from_rig=np.array(poses) if len(poses) == len(file.cameras) else None,
         baseline_m=baseline,
         baseline_stddev_m=file.baseline_stddev_m,
+        refine_cam_from_rig=file.refine_cam_from_rig,
     )
 
 
@@ -129,6 +130,7 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         ),
         refine_normal="normal" in port.refine,
         refine_distance="distance" in port.refine,
+        valid_radius_px=entry.intrinsics.valid_radius_px,
     )
 
 
@@ -263,6 +265,7 @@ def dump_rig(
         "version": 1,
         "water": {"refractive_index": rig.cameras[0].port.n_water},
         "baseline_stddev_m": float(rig.baseline_stddev_m),
+        "refine_cam_from_rig": rig.refine_cam_from_rig,
     }
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):
@@ -296,6 +299,8 @@ def _block(rig: Rig, i: int) -> dict[str, Any]:
             "refine": [name for name, chosen in refine.items() if chosen],
         },
     }
+    if camera.valid_radius_px is not None:
+        block["intrinsics"]["valid_radius_px"] = camera.valid_radius_px
     if i > 0 and rig.cam_from_rig is None:
         block["baseline_m"] = float(rig.baseline_m)
     elif i > 0 and rig.cam_from_rig is not None:

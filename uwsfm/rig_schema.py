@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 _Pixels = Annotated[int, Field(ge=1, le=100_000)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
+_Radius = Annotated[_Number, Field(gt=0)]
 _Index = Annotated[_Number, AfterValidator(checked_index)]
 # YAML lists arrive as Python lists; strict mode would take nothing but tuples.
 _Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
@@ -68,6 +69,7 @@ class ColmapLens(Entry):
     width_px: _Pixels
     height_px: _Pixels
     params: _Numbers
+    valid_radius_px: _Radius | None = None
 
     def to_camera(self) -> pycolmap.Camera:
         return camera_from_colmap(
@@ -86,6 +88,7 @@ class OpenCvBlock(Entry):
 
 class OpenCvLens(Entry):
     opencv: OpenCvBlock
+    valid_radius_px: _Radius | None = None
 
     def to_camera(self) -> pycolmap.Camera:
         block = self.opencv.model_dump()
@@ -138,6 +141,7 @@ class RigFile(Entry):
     version: Literal[1]
     water: WaterEntry
     baseline_stddev_m: Annotated[_Number, Field(ge=0)] = 0.0
+    refine_cam_from_rig: bool = True
     cameras: Annotated[tuple[CameraEntry, ...], Field(strict=False)]
 
 

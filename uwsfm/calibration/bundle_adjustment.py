@@ -69,14 +69,10 @@ def calibrate(
     everything = np.ones(scene.num_observations, dtype=bool)
     run = _Run(scene, settings, report)
     solved = run.solve(State.from_scene(scene), everything, settings.loss)
-    iterations = solved.result.num_iterations
     if settings.loss != "l2":
         sigma = solved.robust_sigma()
-        keep = run.prune(solved.state, sigma)
-        solved = run.solve(solved.state, keep, "l2", sigma)
-        iterations += solved.result.num_iterations
-    summary = _summary(scene, solved, iterations, time.perf_counter() - began)
-    _check_ports(solved.state)
+        solved = run.solve(solved.state, run.prune(solved.state, sigma), "l2", sigma)
+    summary = _summary(run, solved, time.perf_counter() - began)
     return CalibrationResult(
         scene=solved.state.to_scene(scene),
         inliers=solved.inliers,
@@ -150,12 +146,36 @@ class _Run:
         self.scene = scene
         self.settings = settings
         self.report = report
-        self.columns = settings.border_columns(len(scene.cameras))
+        self.at_zero = np.zeros(len(scene.cameras), dtype=bool)
+        self.num_iterations = 0
+
+    @property
+    def columns(self) -> IndexArray:
+        return self.settings.border_columns(self.at_zero)
 
     def solve(
         self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float = 1.0
     ) -> _Solved:
-        """Minimise over the observations kept whose points are seen twice."""
+        """Minimise over the observations kept whose points are seen twice.
+
+        No port is behind its camera: a distance that comes out negative is held at
+        zero, and the rest is solved again.
+        """
+        self.at_zero[:] = False
+        solved = self._solve_free(start, keep, loss, sigma_px)
+        while np.any(negative := solved.state.ports[:, 3] < 0.0):
+            self.at_zero |= negative
+            ports = solved.state.ports.copy()
+            ports[self.at_zero, 3] = 0.0
+            solved = self._solve_free(
+                replace(solved.state, ports=ports), keep, loss, sigma_px
+            )
+        _check_normals(solved.state)
+        return solved
+
+    def _solve_free(
+        self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float
+    ) -> _Solved:
         counts = np.bincount(self.scene.point_idx[keep], minlength=len(start.points))
         inliers = keep & (counts[self.scene.point_idx] >= 2)
         part, used = self.scene.select(inliers)
@@ -165,10 +185,13 @@ class _Run:
             loss_scale_px=self.settings.loss_scale_px,
             max_iterations=self.settings.max_iterations,
             initial_damping=self.settings.initial_damping,
+            # The robust solve only has to tell outliers apart, and creeps at its end.
+            min_relative_decrease=1e-9 if loss == "l2" else 1e-5,
         )
         priors = self.priors(sigma_px)
         part_state = replace(start, points=start.points[used])
         result = minimize(layout, part_state, options, priors, self.report)
+        self.num_iterations += result.num_iterations
         points = np.full_like(self.scene.points, np.nan)
         points[used] = result.state.points
         return _Solved(
@@ -183,7 +206,6 @@ class _Run:
     def prune(self, state: State, sigma_px: float) -> NDArray[np.bool_]:
         """Mask (N,) of the observations within prune_sigma of their projections."""
         limit = self.settings.prune_sigma * max(sigma_px, MIN_NOISE_PX)
-        _check_ports(state)
         residuals = state.to_scene(self.scene).residuals()
         return np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
 
@@ -202,19 +224,18 @@ class _Run:
         )
 
 
-def _check_ports(state: State) -> None:
+def _check_normals(state: State) -> None:
     for camera, row in enumerate(state.ports):
-        if row[3] < 0.0 or row[2] <= 0.0:
+        if not row[2] > 0.0:
             raise UwsfmError(
-                f"the port of camera {camera} came out at {1e3 * row[3]:.1f} mm with "
-                f"normal ({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the images do not "
-                "determine it; hold its distance, or add frames at other altitudes"
+                f"the port normal of camera {camera} turned away from the water, to "
+                f"({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the start is too far off "
+                "or cam_from_rig is wrong"
             )
 
 
-def _summary(
-    scene: Scene, solved: _Solved, iterations: int, seconds: float
-) -> CalibrateSummary:
+def _summary(run: _Run, solved: _Solved, seconds: float) -> CalibrateSummary:
+    scene = run.scene
     before = np.sum(scene.residuals() ** 2, axis=1)
     squares = solved.result.squares[np.isfinite(solved.result.squares)]
     freedom = solved.degrees_of_freedom
@@ -228,7 +249,7 @@ def _summary(
         num_observations=len(solved.layout.xy),
         num_outliers=scene.num_observations - int(np.count_nonzero(solved.inliers)),
         num_invalid=solved.result.num_invalid,
-        num_iterations=iterations,
+        num_iterations=run.num_iterations,
         converged=solved.result.stop is Stop.CONVERGED,
         initial_rms_px=float(np.sqrt(np.nanmean(before))),
         rms_px=float(np.sqrt(np.mean(squares))),
@@ -254,15 +275,17 @@ def _covariance(run: _Run, solved: _Solved, sigma_px: float) -> Covariance:
         frames=variance * reduced.frames(solved.layout),
         points=points,
         cameras=tuple(
-            _camera_covariance(border, cols, pose)
-            for cols, pose in zip(columns, solved.state.cam_from_rig, strict=True)
+            _camera_covariance(border, cols, pose, bool(at_zero))
+            for cols, pose, at_zero in zip(
+                columns, solved.state.cam_from_rig, run.at_zero, strict=True
+            )
         ),
         determined=reduced.determined,
     )
 
 
 def _camera_covariance(
-    border: Array, cols: IndexArray, cam_from_rig: Array
+    border: Array, cols: IndexArray, cam_from_rig: Array, at_zero: bool
 ) -> CameraCovariance:
     padded = np.zeros((len(border) + 1, len(border) + 1))
     padded[:-1, :-1] = border  # HELD = -1 reads the zeros at the end
@@ -274,4 +297,5 @@ def _camera_covariance(
         distance_stddev_m=float(np.sqrt(block[8, 8])),
         rotation_stddev_deg=float(np.degrees(np.sqrt(np.trace(block[:3, :3])))),
         translation_stddev_m=tuple(np.sqrt(translation).tolist()),
+        distance_at_zero=at_zero,
     )

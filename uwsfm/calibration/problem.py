@@ -54,15 +54,20 @@ class CalibrateOptions:
                 f"baseline_stddev_m must be >= 0, got {self.baseline_stddev_m}"
             )
 
-    def border_columns(self, num_cameras: int) -> IndexArray:
-        """(C, BORDER_SIZE) columns of what is refined, HELD for the rest."""
+    def border_columns(self, at_zero: NDArray[np.bool_]) -> IndexArray:
+        """(C, BORDER_SIZE) columns of what is refined, HELD for the rest.
+
+        Args:
+            at_zero: (C,) ports whose distance is held at zero, its bound.
+        """
+        num_cameras = len(at_zero)
         normals = _per_camera("refine_normals", self.refine_normals, num_cameras)
         distances = _per_camera("refine_distances", self.refine_distances, num_cameras)
         free = np.zeros((num_cameras, 9), dtype=bool)
         free[1:, :5] = self.refine_cam_from_rig
         free[1:, 5] = self.baseline_stddev_m > 0.0
         free[:, 6:8] = normals[:, None]
-        free[:, 8] = distances
+        free[:, 8] = distances & ~at_zero
         columns = np.full((num_cameras, 10), HELD, dtype=np.int64)
         columns[:, :9][free] = np.arange(np.count_nonzero(free))
         if self.refine_water_index:
@@ -90,6 +95,9 @@ class CameraCovariance:
     """Root mean square angle of cam_from_rig's rotation."""
     translation_stddev_m: tuple[float, float, float]
     """Of cam_from_rig's translation; its length adds only if it is not held."""
+    distance_at_zero: bool
+    """The images wanted a negative port distance, which no housing has: it was held at
+    zero. They contradict the lens or the water index that was given."""
 
 
 @dataclass(frozen=True, kw_only=True)

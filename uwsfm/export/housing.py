@@ -31,8 +31,10 @@ def _comments(model: Model, calibration: CalibrationResult, index: int) -> list[
     lines = []
     if camera.refine_normal:
         lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
-    if camera.refine_distance:
-        verdict = distance_verdict(distance, cov, True)
+    verdict = distance_verdict(distance, cov, camera.refine_distance)
+    if cov.distance_at_zero:
+        lines.append(f"distance: {verdict}; the images contradict the lens in air")
+    elif camera.refine_distance:
         lines.append(
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} mm, "
             f"{verdict} by the images"

@@ -43,7 +43,8 @@ def housing_summary(model: Model, calibration: CalibrationResult) -> list[dict]:
                 ),
                 "distance_m": port.distance,
                 "distance_stddev_m": _stddev(
-                    cov.distance_stddev_m, camera.refine_distance
+                    cov.distance_stddev_m,
+                    camera.refine_distance and not cov.distance_at_zero,
                 ),
                 "distance_verdict": distance_verdict(
                     port.distance, cov, camera.refine_distance
@@ -72,6 +73,8 @@ def distance_verdict(distance: float, cov: CameraCovariance, refined: bool) -> s
     stddev = cov.distance_stddev_m
     if not refined:
         return "held"
+    if cov.distance_at_zero:
+        return "ran into zero"
     if not math.isfinite(stddev) or stddev >= abs(distance):
         return "not determined"
     return "determined" if stddev < 0.25 * abs(distance) else "weakly determined"

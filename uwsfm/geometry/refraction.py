@@ -97,10 +97,10 @@ def _solve_bracketed(height, r2, dist, thick, n_glass, n_water):
         return 1.0 / paraxial
     low = 0.0
     high = math.sqrt(u_max / r2)
-    if thick == 0.0 and n_glass < n_water:
-        # No layer to travel sideways in: F stays finite at the critical angle.
-        if not high * (dist + height * slope(n_water, u_max)) > 1.0:
-            return math.nan
+    no_glass = thick == 0.0 and n_glass < n_water
+    # Then no layer lets F grow without bound: it stays finite at the critical angle.
+    if no_glass and not high * (dist + height * slope(n_water, u_max)) > 1.0:
+        return math.nan
     q = min(1.0 / paraxial, 0.5 * high)
     for _ in range(4 * MAX_STEPS):
         u = q * q * r2

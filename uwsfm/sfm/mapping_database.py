@@ -185,6 +185,7 @@ def _verify(path: Path, options: StartOptions, progress: Progress) -> None:
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.min_num_inliers = options.verification.min_num_inliers
     geometry.ransac.max_error = options.verification.max_error_px
+    geometry.ransac.max_num_trials = options.verification.max_num_trials
     geometry.ransac.random_seed = options.seed
     geometry.detect_watermark = False  # a sled in view is no watermark: use masks
     verifier = pycolmap.GeometricVerifierOptions()

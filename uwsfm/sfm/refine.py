@@ -56,6 +56,7 @@ def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined
     options = {
         "refine_normals": tuple(camera.refine_normal for camera in rig.cameras),
         "refine_distances": tuple(camera.refine_distance for camera in rig.cameras),
+        "refine_cam_from_rig": rig.refine_cam_from_rig,
         "baseline_stddev_m": rig.baseline_stddev_m,
     }
     steps = 0
@@ -65,13 +66,16 @@ def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined
         steps += 1
         progress("refractive bundle adjustment", steps, None)
 
-    scene = retriangulated(scene)
-    keep = good_observations(scene, MAX_START_ERROR_PX)
+    calibrated = within_valid_radius(scene, rig)
+    scene = retriangulated(scene, calibrated)
+    keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
     start = scene
     part, used = scene.select(_require(keep, scene))
     first = calibrate(part, report=report, **options)
-    scene = retriangulated(_with_result(scene, first), first.inliers, keep)
-    keep = good_observations(scene, MAX_ERROR_PX)
+    trusted = np.zeros_like(keep)
+    trusted[np.nonzero(keep)[0][first.inliers]] = True
+    scene = retriangulated(_with_result(scene, first), trusted)
+    keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     part, used = scene.select(_require(keep, scene))
     second = calibrate(part, report=report, **options)
     kept = np.nonzero(keep)[0][second.inliers]
@@ -96,24 +100,24 @@ def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
     )
 
 
-def retriangulated(
-    scene: Scene,
-    inliers: NDArray[np.bool_] | None = None,
-    among: NDArray[np.bool_] | None = None,
-) -> Scene:
+def within_valid_radius(scene: Scene, rig: Rig) -> NDArray[np.bool_]:
+    """Mask (N,) of the observations that the calibrations in air covered."""
+    radii = [c.valid_radius_px for c in rig.cameras]
+    limits = np.array([np.inf if radius is None else radius for radius in radii])
+    centers = np.array([camera.lens[2:4] for camera in scene.cameras])
+    offset = scene.xy - centers[scene.camera_idx]
+    return np.linalg.norm(offset, axis=1) <= limits[scene.camera_idx]
+
+
+def retriangulated(scene: Scene, trusted: NDArray[np.bool_]) -> Scene:
     """The scene with its points intersected from the water rays.
 
     Args:
         scene: its points are not used.
-        inliers: mask over the observations of ``among``; only those shape the points.
-        among: (N,) mask of observations; all by default.
+        trusted: (N,) mask of the observations that shape the points.
     """
     origins, dirs = scene.water_rays()
-    use = np.ones(scene.num_observations, dtype=bool)
-    if inliers is not None:
-        use[:] = False
-        use[np.nonzero(among)[0] if among is not None else slice(None)] = inliers
-    dirs = np.where(use[:, None], dirs, np.nan)
+    dirs = np.where(trusted[:, None], dirs, np.nan)
     points = triangulate_tracks(origins, dirs, scene.point_idx, scene.num_points)
     return replace(scene, points=points)
 

@@ -27,6 +27,11 @@ SAME_MISFIT = 1.5
 MAX_MISFIT = 0.05
 """Radians: about 3 degrees. A port tilted by 8 degrees bends the rays by 2."""
 
+POSE_HINT = (
+    "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
+    "the axes of translation_m"
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PairFit:
@@ -86,7 +91,7 @@ def check_rig(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> No
             raise InputError(
                 f"cameras {names[0]!r} and {names[1]!r} contradict their images: as "
                 f"described, only {given.in_front:.0%} of the points that both see lie "
-                f"in front of them; {' or '.join(remedies)}"
+                f"in front of them; probably {' or '.join(remedies)}"
             )
         if given.in_front < MIN_IN_FRONT:
             raise InputError(
@@ -102,8 +107,7 @@ def misfit_error(name_a: str, name_b: str, misfit: float) -> InputError:
     return InputError(
         f"cam_from_rig of camera {name_b!r} is wrong by several degrees: rays of the "
         f"same point in {name_a!r} and {name_b!r} miss each other by "
-        f"{np.degrees(misfit):.1f} degrees; check its rotation (order x, y, z, w; "
-        "x_in_cam = R x_in_rig + translation_m) and the axes of translation_m"
+        f"{np.degrees(misfit):.1f} degrees; {POSE_HINT}"
     )
 
 
@@ -148,4 +152,5 @@ def _remedies(
     if not good:
         return []
     limit = SAME_MISFIT * min(fit.misfit for fit in good.values())
-    return [phrase for phrase, fit in good.items() if fit.misfit <= limit]
+    likely = sorted(good, key=lambda phrase: good[phrase].misfit)
+    return [phrase for phrase in likely if good[phrase].misfit <= limit]

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
-from uwsfm.sfm.rig_check import MIN_RIG_MATCHES, misfit_error
+from uwsfm.sfm.rig_check import MIN_RIG_MATCHES, POSE_HINT, misfit_error
 from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
 
 MAX_MATCHES = 20_000
@@ -25,6 +26,8 @@ NOISE = 1e-3
 """Radians, less than a pixel: where the robust loss sets in."""
 MAX_TURN_DEG = 5.0
 """A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
+NOTABLE_TURN_DEG = 1.5
+"""A relative port tilt of 6 degrees: worth a word."""
 MAX_REST = 5e-3
 """Radians that no turn explains, median: a wrong direction of the baseline."""
 
@@ -40,6 +43,16 @@ class RigRotation:
     misfit_before: float
     """Median angle by which rays miss their epipolar plane, radians."""
     misfit_after: float
+
+    def warnings(self, rig: Rig) -> list[str]:
+        """What the user should know, one sentence each."""
+        return [
+            f"camera {camera.name!r} was turned by {turn:.1f} degrees to fit the "
+            "images: its port is tilted by about four times that, or its "
+            "cam_from_rig is wrong"
+            for camera, turn in zip(rig.cameras, self.turn_deg, strict=True)
+            if turn > NOTABLE_TURN_DEG
+        ]
 
 
 def correct_rotations(
@@ -91,10 +104,16 @@ def correct_rotations(
     turn_deg[1:] = np.degrees(np.linalg.norm(solution.x.reshape(-1, 3), axis=1))
     before = float(np.median(np.abs(angles(np.asarray(cam_from_rig)))))
     after = float(np.median(np.abs(angles(poses))))
-    if turn_deg.max() > MAX_TURN_DEG or after > MAX_REST:
-        worst = int(turn_deg.argmax()) or used[0].camera_b
-        other = 0 if worst else used[0].camera_a
-        raise misfit_error(rig.cameras[other].name, rig.cameras[worst].name, before)
+    worst = int(turn_deg.argmax())
+    if turn_deg[worst] > MAX_TURN_DEG:
+        raise InputError(
+            f"cam_from_rig of camera {rig.cameras[worst].name!r} does not fit the "
+            f"images: it would have to turn by {turn_deg[worst]:.0f} degrees or more, "
+            f"which no tilted port explains; {POSE_HINT}"
+        )
+    if after > MAX_REST:
+        names = (rig.cameras[i].name for i in (used[0].camera_a, used[0].camera_b))
+        raise misfit_error(*names, after)
     return RigRotation(
         cam_from_rig=poses,
         turn_deg=turn_deg,

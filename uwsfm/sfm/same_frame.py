@@ -111,6 +111,7 @@ def _epipolar_inliers(
     )
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_EPIPOLAR_ANGLE
+    options.min_num_trials = 50
     options.max_num_trials = 2000
     options.random_seed = SEED
     estimate = pycolmap.estimate_essential_matrix(

@@ -133,7 +133,7 @@ def perspective_start(
     steps.run(
         "mapping",
         [key, asdict(options.mapping)],
-        lambda: _map(frames, fixed(), space, options, progress),
+        lambda: _map(rig, frames, fixed(), space, options, progress),
         outputs=[space.perspective],
     )
     start = load_start(space.perspective, space.features, frames)
@@ -249,6 +249,7 @@ def _fix_rig(rig: Rig, poses: Array, frames: Frames, space: Workspace) -> _Fixed
 
 
 def _map(
+    rig: Rig,
     frames: Frames,
     fixed: _FixedRig,
     space: Workspace,
@@ -262,18 +263,21 @@ def _map(
         fixed.rotation.cam_from_rig,
         fixed.pinholes,
         fixed.depths,
-        _summary(frames, fixed, models),
+        _summary(rig, frames, fixed, models),
     )
 
 
 def _summary(
-    frames: Frames, fixed: _FixedRig, models: Sequence[pycolmap.Reconstruction]
+    rig: Rig,
+    frames: Frames,
+    fixed: _FixedRig,
+    models: Sequence[pycolmap.Reconstruction],
 ) -> dict[str, Any]:
     best = models[0]
     registered = {best.images[i].name.rpartition("/")[2] for i in best.reg_image_ids()}
     missing = [name for name in frames.names if name not in registered]
     others = [model.num_reg_frames() for model in models[1:]]
-    warnings = frames.warnings()
+    warnings = frames.warnings() + fixed.rotation.warnings(rig)
     if missing:
         warnings.append(
             f"{len(missing)} of {len(frames.names)} frames could not be registered: "

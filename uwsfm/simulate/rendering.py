@@ -21,6 +21,7 @@ from uwsfm.simulate.texture import Image, Plane
 
 SAMPLES_PER_BLOCK = 200_000  # bounds the memory: about 300 bytes per sample
 NUM_THREADS = 2
+OPEN_WATER = 1000.0  # metres: no light crosses that
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +152,8 @@ def _rendered_rows(
             points = origins[rows] + distance[:, None] * dirs[rows]
             spacing = distance * _sample_angle(camera, side)
             reflectance[rows] = _reflectance(surface, hits, rows, points, spacing)
-    # Rays that leave the scene see open water: nothing at an infinite distance.
-    distance = hits.distance[:, None]
+    # Rays that leave the scene see open water: nothing, very far away.
+    distance = np.minimum(hits.distance, OPEN_WATER)[:, None]
     radiance = reflectance * np.exp(-distance * _float32(water.attenuation_per_m))
     scattered = 1.0 - np.exp(-distance * _float32(water.backscatter_per_m))
     radiance += _float32(water.veil) * scattered

@@ -164,6 +164,7 @@ def _render_images(spec: SequenceSpec, folder: Path, progress: Progress) -> None
         boxes[..., 0, :].min(axis=(0, 1)),
         boxes[..., 1, :].max(axis=(0, 1)),
     )
+    progress("sea floor", 1, 1)
     names = frame_names(len(poses))
     done, total = 0, len(poses) * len(spec.rig.cameras)
     cameras = spec.rig.refractive_cameras()

@@ -1,0 +1,37 @@
+"""The main job on the sample, beside the sample's truth."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from uwsfm._progress import Progress, silent
+from uwsfm.errors import UwsfmError
+from uwsfm.evaluate import Comparison, compare_with_truth
+from uwsfm.reconstruct import ReconstructResult, reconstruct
+
+
+def sample_dir() -> Path:
+    """The rendered sample: in the installed package, or in the source tree.
+
+    Raises:
+        UwsfmError: neither is there.
+    """
+    package = Path(str(files("uwsfm")))
+    for folder in (
+        package / "datasets" / "sample",
+        package.parent / "datasets" / "sample",
+    ):
+        if (folder / "rig.yaml").exists():
+            return folder
+    raise UwsfmError(f"the sample is missing from the installation in {package}")
+
+
+def run_demo(
+    out: str | Path, progress: Progress = silent
+) -> tuple[ReconstructResult, Comparison]:
+    """Reconstruct the sample into ``out``, and compare with its truth."""
+    sample = sample_dir()
+    result = reconstruct(sample / "rig.yaml", sample / "images", out, progress=progress)
+    truth = compare_with_truth(
+        result.model, result.summary["cameras"], sample / "truth.json"
+    )
+    return result, truth
