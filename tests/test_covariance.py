@@ -15,7 +15,8 @@ from uwsfm.solver.state import State
 
 
 def linearized(scene, options):
-    layout = build_layout(scene, options.border_columns(len(scene.cameras)))
+    at_zero = np.zeros(len(scene.cameras), dtype=bool)
+    layout = build_layout(scene, options.border_columns(at_zero))
     problem = lm.Problem(layout, lm.LevenbergMarquardtOptions(), lm.NO_PRIORS)
     return layout, problem.linearize(State.from_scene(scene))
 

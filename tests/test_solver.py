@@ -18,6 +18,7 @@ from uwsfm.solver.state import State
 
 # All that can be free: 3 + 2 + 1 of the second camera, 3 of both ports, the index.
 EVERYTHING = CalibrateOptions(refine_water_index=True, baseline_stddev_m=0.002)
+NONE_AT_ZERO = np.zeros(2, dtype=bool)
 OFF = Perturbation(
     rotation_stddev_deg=0.3,
     translation_stddev=0.005,
@@ -27,7 +28,7 @@ OFF = Perturbation(
 
 
 def problem_of(scene, options=EVERYTHING, loss="l2", prior_weight=1e4):
-    layout = build_layout(scene, options.border_columns(len(scene.cameras)))
+    layout = build_layout(scene, options.border_columns(NONE_AT_ZERO))
     priors = lm.NO_PRIORS
     if options.baseline_stddev_m > 0.0:
         priors = lm.LengthPriors(
@@ -203,7 +204,7 @@ def test_layout_sorts_observations_and_holds_the_first_observed_frame(rng):
         point_idx=scene.point_idx[shuffled],
         xy=scene.xy[shuffled],
     ).select(keep)
-    layout = build_layout(scene, CalibrateOptions().border_columns(2))
+    layout = build_layout(scene, CalibrateOptions().border_columns(NONE_AT_ZERO))
     assert layout.frame_col.tolist() == [HELD, HELD, 0, 6]
     table = np.column_stack([scene.point_idx, scene.frame_idx, scene.camera_idx])
     assert table[layout.order].tolist() == sorted(table.tolist())

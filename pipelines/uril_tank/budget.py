@@ -1,7 +1,10 @@
 """What errors of the given numbers would do to the estimates: solved again."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 
@@ -54,3 +57,34 @@ def error_budget(model: Model, refine_cam_from_rig: bool) -> str:
             cells += [f"{tilt:.2f}", f"{1e3 * (new.distance - old.distance):+.1f}"]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def recalibration(data: Path) -> str:
+    """How far a second calibration from the same boards in air is from the first."""
+    lens = json.loads((data / "in_air_calibration.json").read_text())
+    corners = np.load(data / "in_air_corners.npz")
+    columns, rows = corners["board_inner"]
+    grid = np.zeros((rows * columns, 3), np.float32)
+    grid[:, :2] = float(corners["square_mm"]) * np.mgrid[:columns, :rows].T.reshape(
+        -1, 2
+    )
+    parts = []
+    for side in ("left", "right"):
+        found = corners[f"land_v1_{side[0].upper()}"]
+        views = [view.reshape(-1, 1, 2) for view in found]
+        _, matrix, *_ = cv2.calibrateCamera(
+            [grid] * len(views),
+            views,
+            tuple(lens["image_size"]),
+            None,
+            None,
+            flags=cv2.CALIB_FIX_K3,
+        )
+        given = np.array(lens[f"K_{side}"])
+        focal = 100.0 * (matrix[0, 0] / given[0, 0] - 1.0)
+        shift = matrix[:2, 2] - given[:2, 2]
+        parts.append(
+            f"{side}: focal length {focal:+.1f} %, principal point "
+            f"({shift[0]:+.1f}, {shift[1]:+.1f}) px"
+        )
+    return "A new calibration from the same boards in air: " + "; ".join(parts)

@@ -110,7 +110,9 @@ def run(data: Path, work: Path, out: Path, rig: Rig) -> SelfCalibrated:
         _copy(features, database)
     pairs = out / "pairs.txt"
     names = [
-        f"{c.images}/{p.name}" for c in rig.cameras for p in _images(data, c.images)
+        f"{camera.images}/{path.name}"
+        for camera in rig.cameras
+        for path in sorted((data / camera.images).glob("*.png"))
     ]
     pairs.write_text(
         "".join(f"{a} {b}\n" for i, a in enumerate(names) for b in names[:i])
