@@ -21,16 +21,18 @@ def linearized(scene, options):
     return layout, problem.linearize(State.from_scene(scene))
 
 
-def repeat_observation(scene, row, shift_px):
-    """A new point, seen twice by the camera of an observation in the same image."""
-    again, point = [row, row], scene.point_idx[row]
+def repeat_observations(scene, rows, shift_px):
+    """New points, each seen twice in the image of an observation and nowhere else."""
+    again = np.repeat(rows, 2)
+    shifts = shift_px * (np.arange(len(again)) % 2)
+    new_idx = scene.num_points + np.repeat(np.arange(len(rows)), 2)
     return replace(
         scene,
-        points=np.vstack([scene.points, scene.points[point]]),
+        points=np.vstack([scene.points, scene.points[scene.point_idx[rows]]]),
         camera_idx=np.append(scene.camera_idx, scene.camera_idx[again]),
         frame_idx=np.append(scene.frame_idx, scene.frame_idx[again]),
-        point_idx=np.append(scene.point_idx, [scene.num_points] * 2),
-        xy=np.vstack([scene.xy, scene.xy[row], scene.xy[row] + shift_px]),
+        point_idx=np.append(scene.point_idx, new_idx),
+        xy=np.vstack([scene.xy, scene.xy[again] + shifts[:, None]]),
     )
 
 
@@ -83,22 +85,22 @@ def test_free_scale_is_found_to_be_undetermined():
         assert np.isnan(points).all() != determined
 
 
-def test_a_point_seen_twice_in_one_image_tells_nothing():
-    """Its block is singular; held still, it would pass for a surveyed landmark."""
+def test_points_seen_twice_in_one_image_tell_nothing():
+    """Their blocks are singular; held still, they would pass for landmarks."""
     clean = perturbed(small_scene(6, 60, noise_px=0.3).scene)
     expected = calibrate(clean, loss="l2")
-    doubled = repeat_observation(clean, row=10, shift_px=1e-6)
+    doubled = repeat_observations(clean, np.arange(0, 300, 30), shift_px=1e-6)
     found = calibrate(doubled, loss="l2")
     assert found.covariance.determined
     noise = found.summary.sigma_px / expected.summary.sigma_px
-    # The point's loose end, 1e-8 of its block, is what is left of it.
+    # What is left of them is how loosely they are held, 1e-8 of their blocks.
     np.testing.assert_allclose(
         np.sqrt(np.diag(found.covariance.border)) / noise,
         np.sqrt(np.diag(expected.covariance.border)),
         rtol=1e-4,
     )
-    assert np.isnan(found.covariance.points[-1]).all()
-    assert np.isfinite(found.covariance.points[:-1]).all()
+    assert np.isnan(found.covariance.points[clean.num_points :]).all()
+    assert np.isfinite(found.covariance.points[: clean.num_points]).all()
 
 
 def test_stddevs_of_a_camera_are_read_from_the_right_columns():

@@ -107,11 +107,11 @@ def _random_dirs(lens, rng, count=400):
     return radius * np.cos(angle), radius * np.sin(angle)
 
 
+# The distortion grows, then turns.
+SWOLLEN = camera_from_line("RADIAL 1000 1000 1000 500 500 0.5 -0.3")
 FOLDING_LENSES = [
     *EXAMPLE_CAMERAS,
-    # The distortion grows, then turns: a start at the distorted radius is near the
-    # limit, where Newton's first step leaves the lens.
-    camera_from_line("RADIAL 1000 1000 1000 500 500 0.5 -0.3"),
+    SWOLLEN,
     camera_from_line("SIMPLE_RADIAL 1000 1000 1000 500 500 -0.3"),
     # Tangential terms fold the image before the radial ones do.
     camera_from_line("OPENCV 1024 768 868 866 525 420 -0.4 0 0.01 0.01"),
@@ -134,6 +134,18 @@ def test_every_pixel_a_lens_projects_to_leads_back_to_the_one_direction(camera, 
     assert folded < 40  # of 400: only the rim, where tangential terms fold it earlier
 
 
+def test_a_pixel_as_far_out_as_the_limit_itself_is_undistorted():
+    """A Newton step from the pixel's own radius would start where the slope is zero."""
+    lens = lens_row(SWOLLEN.model_name, SWOLLEN.params)
+    for share in (0.99, 1 - 1e-4, 1 - 1e-7, 1.0, 1 + 1e-7, 1 + 1e-4, 1.05):
+        radius = share * np.sqrt(lens[13])
+        x, y, z = dir_from_img(500.0 + 600.0 * radius, 500.0 + 800.0 * radius, lens)
+        back = img_from_dir(x, y, z, lens)[:2]
+        np.testing.assert_allclose(
+            back, 500.0 + radius * np.array([600, 800]), atol=1e-9
+        )
+
+
 def test_beyond_the_turning_point_of_a_barrel_lens_there_is_no_answer():
     camera = camera_from_line("SIMPLE_RADIAL 1000 1000 1000 500 500 -0.3")
     lens = lens_row(camera.model_name, camera.params)
@@ -142,12 +154,13 @@ def test_beyond_the_turning_point_of_a_barrel_lens_there_is_no_answer():
     rim = 500.0 + 1000.0 * limit * (1.0 - 0.3 * limit**2)  # the farthest pixel
 
     both = RefractiveCamera(camera, NO_PORT)
-    points = np.array([[0.99 * limit, 0, 1], [1.01 * limit, 0, 1]])
+    # At 2.5 the lens has turned the image over, twice: there its Jacobian looks sound.
+    points = np.array([[0.99 * limit, 0, 1], [1.01 * limit, 0, 1], [2.5, 0, 1]])
     xy, valid = both.img_from_point(points)
-    # COLMAP gives 1.01 the pixel of the false, second ray.
-    assert valid.tolist() == [True, False] and np.isnan(xy[1]).all()
+    # COLMAP gives them the pixels of false, second rays.
+    assert valid.tolist() == [True, False, False] and np.isnan(xy[1:]).all()
     assert np.isfinite(camera.img_from_cam(points)).all()
-    assert both.status_from_point(points)[1] == Status.OUTSIDE_LENS
+    assert both.status_from_point(points)[1:].tolist() == [Status.OUTSIDE_LENS] * 2
 
     pixels = np.array([[rim - 0.1, 500.0], [rim + 0.1, 500.0]])
     assert both.status_from_img(pixels).tolist() == [Status.VALID, Status.OUTSIDE_LENS]

@@ -176,6 +176,11 @@ def test_the_committed_sample_is_the_preset():
         for key in ("normal", "cam_from_rig"):
             camera[key] = np.round(camera[key], 12).tolist()
     assert truth == expected
+    start = load_rig(SAMPLE / "rig.yaml")
+    np.testing.assert_allclose(start.cam_from_rig, spec.rig.cam_from_rig, atol=1e-12)
+    for given, true in zip(start.cameras, spec.rig.cameras, strict=True):
+        assert (given.port.normal, given.port.distance) == ((0.0, 0.0, 1.0), 0.01)
+        np.testing.assert_array_equal(given.camera.params, true.camera.params)
 
 
 def test_the_sample_moves_as_its_description_says():

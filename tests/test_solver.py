@@ -82,6 +82,9 @@ def test_schur_step_equals_the_dense_step(loss, damping):
     baseline[layout.num_frame_cols + layout.border_col[1, 5]] = 100.0  # sqrt(weight)
     jac = np.vstack([jac, baseline])
     residuals = np.append(residuals, 100.0 * (state.baselines[1] - 0.201))
+    if loss == "l2":
+        cost = problem.cost(state)[0]
+        assert cost == pytest.approx(0.5 * residuals @ residuals, rel=1e-12)
     normal, gradient = jac.T @ jac, jac.T @ residuals
     damped = normal + np.diag(damping * np.maximum(np.diag(normal), 1e-6))
     # Solved on the scaled system: its condition is what limits both sides.

@@ -3,6 +3,17 @@
 The public names are imported on first use, so that ``import uwsfm`` costs nothing.
 """
 
+import sys
+
+if (
+    sys.platform == "linux"
+    and "pycolmap" in sys.modules
+    and "zlib" not in {*sys.modules, *sys.builtin_module_names}
+):
+    # pycolmap 4.2 exports a zlib of its own: Python's, if it is loaded afterwards,
+    # frees the other's memory and aborts the process at its first compression.
+    raise ImportError("import uwsfm before pycolmap: the other order aborts in zlib")
+
 import logging
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING
@@ -17,7 +28,7 @@ if TYPE_CHECKING:
     from uwsfm.models.port import FlatPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
-    from uwsfm.reconstruct import reconstruct
+    from uwsfm.pipeline import reconstruct
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
@@ -43,7 +54,7 @@ _HOMES = {
     "export_ply": "uwsfm.export.files",
     "load_rig": "uwsfm.rig_file",
     "read_model": "uwsfm.export.files",
-    "reconstruct": "uwsfm.reconstruct",
+    "reconstruct": "uwsfm.pipeline",
 }
 
 __all__ = [

@@ -11,9 +11,10 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba
+from numba.core import config
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -47,11 +48,12 @@ def _cache_dir() -> Path | None:
 
 CACHE_DIR = _cache_dir()
 if CACHE_DIR is not None:
-    numba.config.CACHE_DIR = str(CACHE_DIR)
+    config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
 def kernel(function: Function) -> Function:
     """Compile with numba: releases the GIL, IEEE division, cached on disk."""
-    return numba.njit(cache=CACHE_DIR is not None, nogil=True, error_model="numpy")(
-        function
+    compiled: Any = numba.njit(
+        cache=CACHE_DIR is not None, nogil=True, error_model="numpy"
     )
+    return compiled(function)

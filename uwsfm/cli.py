@@ -87,7 +87,7 @@ def reconstruct(
     Run the same command again to resume a run that was stopped.
     """
     from uwsfm.console import ProgressBars
-    from uwsfm.reconstruct import reconstruct as run
+    from uwsfm.pipeline import reconstruct as run
 
     with ProgressBars() as progress:
         result = run(

@@ -6,7 +6,7 @@ from pathlib import Path
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.evaluate import Comparison, compare_with_truth
-from uwsfm.reconstruct import ReconstructResult, reconstruct
+from uwsfm.pipeline import ReconstructResult, reconstruct
 
 
 def sample_dir() -> Path:

@@ -1,0 +1,149 @@
+"""Every command, and the sentences in which its mistakes end."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+COMMANDS = [
+    [],
+    ["init"],
+    ["reconstruct"],
+    ["demo"],
+    ["simulate"],
+    ["simulate", "images"],
+    ["simulate", "observations"],
+]
+
+
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command line as a user starts it."""
+    return subprocess.run(
+        [sys.executable, "-c", "from uwsfm.cli import main; main()", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help(command):
+    found = run(*command, "--help")
+    assert found.returncode == 0, found.stderr
+    assert "Usage" in found.stdout
+
+
+def test_help_and_version_import_nothing_heavy():
+    heavy = ("numpy", "scipy", "numba", "pycolmap", "cv2", "open3d", "yaml")
+    code = (
+        "import sys; sys.argv = ['uwsfm', '--version']\n"
+        "from uwsfm.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert found.stdout.splitlines()[-1] == "[]"
+
+
+def test_init_writes_a_rig_file_once(tmp_path):
+    assert run("init", "rig.yaml", cwd=tmp_path).returncode == 0
+    written = (tmp_path / "rig.yaml").read_text()
+    assert "cam_from_rig" in written
+    again = run("init", "rig.yaml", cwd=tmp_path)
+    assert again.returncode == 2
+    assert again.stderr.strip() == "error: rig.yaml exists already: name another file"
+    assert (tmp_path / "rig.yaml").read_text() == written
+
+
+def _one_sentence(found: subprocess.CompletedProcess[str], *parts: str) -> None:
+    assert found.returncode != 0
+    lines = [line for line in found.stderr.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, found.stderr
+    assert "Traceback" not in found.stderr
+    for part in parts:
+        assert part in lines[0]
+
+
+def test_reconstruct_names_what_is_missing(tmp_path):
+    _one_sentence(
+        run("reconstruct", "nowhere.yaml", "images", "-o", "out", cwd=tmp_path),
+        "nowhere.yaml",
+    )
+    run("init", "rig.yaml", cwd=tmp_path)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", "images", "-o", "out", cwd=tmp_path),
+        "images",
+        "does not exist",
+    )
+    (tmp_path / "images" / "left").mkdir(parents=True)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", "images", "-o", "out", cwd=tmp_path),
+        "left",
+        "holds no image",
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"rig.yaml", "images"}
+
+
+def test_reconstruct_never_overwrites_a_foreign_model(tmp_path):
+    (tmp_path / "project" / "sparse").mkdir(parents=True)
+    keep = tmp_path / "project" / "sparse" / "cameras.bin"
+    keep.write_bytes(b"mine")
+    run("init", "rig.yaml", cwd=tmp_path)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", ".", "-o", "project", cwd=tmp_path),
+        "was not made by uwsfm",
+    )
+    assert keep.read_bytes() == b"mine"
+
+
+def test_unsupported_lens_is_named(tmp_path):
+    run("init", "rig.yaml", cwd=tmp_path)
+    text = (tmp_path / "rig.yaml").read_text()
+    text = text.replace("model: OPENCV", "model: FOV")
+    text = text.replace(
+        "params: [1400.0, 1400.0, 960.0, 540.0, -0.1, 0.05, 0.0, 0.0]",
+        "params: [1400.0, 1400.0, 960.0, 540.0, 0.9]",
+    )
+    (tmp_path / "rig.yaml").write_text(text)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path), "'left'", "FOV"
+    )
+
+
+def test_simulate_observations_calibrate_back(tmp_path):
+    """The file holds all that `Scene.from_arrays` takes, and the truth."""
+    found = run("simulate", "observations", "-o", "dive.npz", cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    with np.load(tmp_path / "dive.npz") as data:
+        assert data["xy"].shape == (len(data["point_idx"]), 2)
+        assert len(data["xy"]) > 1000
+    _one_sentence(
+        run("simulate", "observations", "-o", "dive.txt", cwd=tmp_path), ".npz"
+    )
+    _one_sentence(
+        run("simulate", "images", "-o", "d", "--preset", "ocean", cwd=tmp_path), "ocean"
+    )
+
+
+def test_output_folder_that_is_a_file(tmp_path):
+    (tmp_path / "out").write_text(json.dumps({}))
+    run("init", "rig.yaml", cwd=tmp_path)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path), "is a file"
+    )
+
+
+def test_importing_pycolmap_first_is_refused_or_works():
+    """Where Python's zlib is a separate module, that order would abort the process."""
+    code = "import pycolmap, uwsfm; uwsfm.FlatPort(); import zlib; zlib.compress(b'x')"
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0 or "import uwsfm before pycolmap" in found.stderr

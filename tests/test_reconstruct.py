@@ -1,0 +1,114 @@
+"""The main job on the rendered sample, end to end, beside its truth."""
+
+import json
+import math
+
+import numpy as np
+import pycolmap
+import pytest
+
+import uwsfm
+from uwsfm.demo import run_demo, sample_dir
+from uwsfm.evaluate import Comparison
+from uwsfm.pipeline import ReconstructResult
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    result, comparison = run_demo(out)
+    return out, result, comparison
+
+
+@pytest.fixture(scope="module")
+def result(demo) -> ReconstructResult:
+    return demo[1]
+
+
+@pytest.fixture(scope="module")
+def comparison(demo) -> Comparison:
+    return demo[2]
+
+
+def test_all_pairs_are_registered(comparison):
+    assert comparison.num_true_frames >= 12
+    assert comparison.num_frames == comparison.num_true_frames
+
+
+def test_ports_are_found(comparison):
+    """0.1 degree and 1.5 mm are what a diver's own measurements cannot reach."""
+    for camera in comparison.cameras:
+        assert camera.tilt_error_deg <= 0.1
+        assert abs(camera.distance_error_m) <= 1.5e-3
+
+
+def test_errors_are_what_the_standard_deviations_promise(comparison):
+    for camera in comparison.cameras:
+        assert camera.tilt_stddev_deg is not None
+        assert camera.distance_stddev_m is not None
+        assert camera.tilt_error_deg <= 3.0 * camera.tilt_stddev_deg
+        assert abs(camera.distance_error_m) <= 3.0 * camera.distance_stddev_m
+        # And they promise something: the sample was made to determine the housings.
+        assert camera.distance_stddev_m < 0.5e-3
+
+
+def test_scale_is_metric(comparison):
+    """Only the first pose is aligned: 2 mm over a dive of two metres is scale too."""
+    assert comparison.center_rms_m <= 2e-3
+
+
+def test_summary_says_everything(demo):
+    out, result, _ = demo
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(result.summary))
+    for camera in summary["cameras"]:
+        assert math.isclose(np.linalg.norm(camera["normal"]), 1.0)
+        for key in ("distance_m", "normal_stddev_deg", "distance_stddev_m"):
+            assert camera[key] > 0.0
+        assert len(camera["cam_from_rig"]["rotation_xyzw"]) == 4
+    rms = summary["reprojection_rms_px"]
+    assert rms["after"] < rms["before"]
+    counts = ("num_frames", "num_registered_frames", "num_points", "num_observations")
+    assert all(summary[key] > 0 for key in counts)
+    assert summary["num_invalid"] == 0
+    assert summary["timings_s"]
+    assert summary["versions"]["pycolmap"] == pycolmap.__version__
+
+
+def test_outputs_open_elsewhere_and_here(demo):
+    out, result, _ = demo
+    colmap = pycolmap.Reconstruction(str(out / "sparse"))
+    assert colmap.num_reg_frames() == result.model.scene.num_frames
+    lens = result.model.rig.cameras[0].camera
+    np.testing.assert_array_equal(colmap.cameras[1].params, lens.params)
+    model = uwsfm.read_model(out)
+    assert model.scene.num_observations == result.model.scene.num_observations
+    # Written and read in double precision; the observations come in another order.
+    rms = np.sqrt(np.mean(model.errors_px() ** 2))
+    assert math.isclose(rms, result.summary["reprojection_rms_px"]["after"])
+    housing = uwsfm.load_rig(out / "housing.yaml")
+    assert housing.cameras[0].port == result.model.rig.cameras[0].port
+    assert (out / "points.ply").read_bytes().startswith(b"ply\nformat binary_little")
+
+
+def test_points_have_believable_uncertainties(result):
+    cov = result.calibration.covariance.points
+    stddev = np.sqrt(np.einsum("pii->p", cov))
+    # A pixel of 0.2 px noise at 1 m with 0.6 m of motion: a millimetre or so.
+    assert np.all(np.isfinite(stddev))
+    assert 1e-4 < np.median(stddev) < 5e-3
+
+
+def test_second_run_starts_from_what_is_on_disk(demo):
+    """And gives the same result: nothing in the refractive part is random."""
+    out, result, _ = demo
+    steps = []
+    sample = sample_dir()
+    again = uwsfm.reconstruct(
+        sample / "rig.yaml",
+        sample / "images",
+        out,
+        progress=lambda step, done, total: steps.append(step),
+    )
+    assert not {"features", "matching", "mapping"} & set(steps)
+    np.testing.assert_array_equal(again.model.scene.points, result.model.scene.points)
