@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -62,15 +63,16 @@ class ProgressBars:
 
 def housing_table(summary: dict[str, Any]) -> Table:
     """The refined housings, each number with its standard deviation."""
-    table = Table(title="Housing", title_justify="left")
-    for column in ("camera", "normal (x, y, z)", "± deg", "distance", "± mm", ""):
-        table.add_column(column, justify="left" if column == "camera" else "right")
+    table = Table(title="Housing: ± is one standard deviation", title_justify="left")
+    table.add_column("camera", no_wrap=True)
+    for column in ("tilt x, y (deg)", "±", "distance (mm)", "±", "by the images"):
+        table.add_column(column, justify="right", no_wrap=True)
     for camera in summary["cameras"]:
         table.add_row(
             camera["name"],
-            _vector(camera["normal"]),
+            _tilt(camera["normal"]),
             _number(camera["normal_stddev_deg"], "{:.3f}"),
-            f"{1e3 * camera['distance_m']:.2f} mm",
+            f"{1e3 * camera['distance_m']:.2f}",
             _number(camera["distance_stddev_m"], "{:.2f}", 1e3),
             camera["distance_verdict"],
         )
@@ -94,37 +96,29 @@ def result_table(summary: dict[str, Any]) -> Table:
 def comparison_table(comparison: Comparison) -> Table:
     """Estimate, standard deviation and truth, side by side."""
     table = Table(title="Estimate against truth", title_justify="left")
-    for column in ("", "estimate", "std. dev.", "truth", "error"):
-        table.add_column(column, justify="right" if column else "left")
+    table.add_column("", no_wrap=True)
+    for column in ("estimate", "±", "truth", "error"):
+        table.add_column(column, justify="right", no_wrap=True)
     for camera in comparison.cameras:
         table.add_row(
-            f"{camera.name}: port normal",
-            _vector(camera.normal),
-            _number(camera.tilt_stddev_deg, "{:.3f} deg"),
-            _vector(camera.true_normal),
-            f"{camera.tilt_error_deg:.3f} deg",
+            f"{camera.name}: port tilt (deg)",
+            _tilt(camera.normal),
+            _number(camera.tilt_stddev_deg, "{:.3f}"),
+            _tilt(camera.true_normal),
+            f"{camera.tilt_error_deg:.3f}",
         )
         table.add_row(
-            f"{camera.name}: port distance",
-            f"{1e3 * camera.distance_m:.2f} mm",
-            _number(camera.distance_stddev_m, "{:.2f} mm", 1e3),
-            f"{1e3 * camera.true_distance_m:.2f} mm",
-            f"{1e3 * camera.distance_error_m:+.2f} mm",
+            f"{camera.name}: port distance (mm)",
+            f"{1e3 * camera.distance_m:.2f}",
+            _number(camera.distance_stddev_m, "{:.2f}", 1e3),
+            f"{1e3 * camera.true_distance_m:.2f}",
+            f"{1e3 * camera.distance_error_m:+.2f}",
         )
-    table.add_row(
-        "frames registered",
-        str(comparison.num_frames),
-        "",
-        str(comparison.num_true_frames),
-        "",
-    )
-    table.add_row(
-        "camera centres, first pose aligned",
-        "",
-        "",
-        "",
-        f"{1e3 * comparison.center_rms_m:.2f} mm RMS",
-    )
+    registered, given = str(comparison.num_frames), str(comparison.num_true_frames)
+    table.add_row("frames", registered, "", given, "")
+    refractive, pinhole = comparison.center_rms_m, comparison.pinhole_center_rms_m
+    table.add_row("rig centres, RMS (mm)", "", "", "", f"{1e3 * refractive:.2f}")
+    table.add_row("  of the pinhole start (mm)", "", "", "", f"{1e3 * pinhole:.2f}")
     return table
 
 
@@ -139,8 +133,10 @@ def timings_table(timings: dict[str, float]) -> Table:
     return table
 
 
-def _vector(values: list[float] | tuple[float, ...]) -> str:
-    return " ".join(f"{value:+.4f}" for value in values)
+def _tilt(normal: list[float] | tuple[float, ...]) -> str:
+    """The normal's slopes against the optical axis, which people can imagine."""
+    x, y = (math.degrees(math.asin(value)) for value in normal[:2])
+    return f"{x:+.3f}, {y:+.3f}"
 
 
 def _number(value: float | None, form: str, scale: float = 1.0) -> str:

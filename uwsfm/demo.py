@@ -31,7 +31,4 @@ def run_demo(
     """Reconstruct the sample into ``out``, and compare with its truth."""
     sample = sample_dir()
     result = reconstruct(sample / "rig.yaml", sample / "images", out, progress=progress)
-    truth = compare_with_truth(
-        result.model, result.summary["cameras"], sample / "truth.json"
-    )
-    return result, truth
+    return result, compare_with_truth(result, sample / "truth.json")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm.colmap import Model
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between
+from uwsfm.pipeline import ReconstructResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,31 +41,25 @@ class Comparison:
     num_frames: int
     center_rms_m: float
     """Of the rig centres after moving the first pose onto the truth: no scaling."""
-    center_max_m: float
+    pinhole_center_rms_m: float
+    """The same of the perspective start."""
 
 
-def compare_with_truth(
-    model: Model, housing: list[dict], truth_path: Path
-) -> Comparison:
-    """Compare a model and its summary's cameras with a truth.json.
-
-    Args:
-        model: the reconstruction.
-        housing: "cameras" of its summary.json.
-        truth_path: truth.json of the simulator.
+def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Comparison:
+    """Compare a reconstruction with a truth.json of the simulator.
 
     Raises:
         InputError: the truth is of other images.
     """
     truth = json.loads(Path(truth_path).read_text(encoding="utf-8"))
     true_poses = truth["rig_from_world"]
+    model = result.model
     unknown = set(model.frame_names) - set(true_poses)
     if unknown:
         raise InputError(f"{truth_path}: no pose of frame {sorted(unknown)[0]}")
     expected = np.array([true_poses[name] for name in model.frame_names])
-    errors = _center_errors(model.scene.rig_from_world, expected)
     cameras = []
-    for entry, camera in zip(housing, truth["cameras"], strict=True):
+    for entry, camera in zip(result.summary["cameras"], truth["cameras"], strict=True):
         cameras.append(
             CameraComparison(
                 name=entry["name"],
@@ -84,14 +78,15 @@ def compare_with_truth(
         cameras=tuple(cameras),
         num_true_frames=len(true_poses),
         num_frames=model.scene.num_frames,
-        center_rms_m=float(np.sqrt(np.mean(errors**2))),
-        center_max_m=float(errors.max()),
+        center_rms_m=_center_rms(model.scene.rig_from_world, expected),
+        pinhole_center_rms_m=_center_rms(result.start.rig_from_world, expected),
     )
 
 
-def _center_errors(rig_from_world: Array, expected: Array) -> Array:
-    """Distances of the rig centres (F,) after aligning the first pose only."""
+def _center_rms(rig_from_world: Array, expected: Array) -> float:
+    """RMS distance of the rig centres after aligning the first pose only."""
     # world here -> first rig -> true world
     true_from_world = rigid3.compose(rigid3.inverse(expected[0]), rig_from_world[0])
     centers = rigid3.transform(true_from_world, rigid3.inverse(rig_from_world)[:, 4:])
-    return np.linalg.norm(centers - rigid3.inverse(expected)[:, 4:], axis=1)
+    errors = centers - rigid3.inverse(expected)[:, 4:]
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

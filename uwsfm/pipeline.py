@@ -40,6 +40,8 @@ class ReconstructResult:
     """Of ``model.scene``, with covariances."""
     summary: dict[str, Any]
     """summary.json"""
+    start: StartArrays
+    """The perspective start, which pinholes fitted to the ports made."""
 
 
 def reconstruct(
@@ -107,7 +109,10 @@ def reconstruct(
     summary = _summary(model, start, refined, timings)
     write_json(summary, out / SUMMARY)
     return ReconstructResult(
-        model=model, calibration=refined.calibration, summary=summary
+        model=model,
+        calibration=refined.calibration,
+        summary=summary,
+        start=arrays,
     )
 
 

@@ -19,7 +19,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
-from uwsfm.sfm.background import opened, quiet_colmap
+from uwsfm.sfm.background import opened
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping_database import (
@@ -123,15 +123,19 @@ def _adjust(
     Everything is in the units of the model.
     """
     poses = np.stack([rigid3.IDENTITY, pose])
-    with quiet_colmap():
-        with opened(database_path) as database:
-            pycolmap.apply_rig_config([rig_config(frames, poses)], database, model)
+    with opened(database_path) as database:
+        pycolmap.apply_rig_config([rig_config(frames, poses)], database, model)
         options = pycolmap.BundleAdjustmentOptions()
         options.refine_focal_length = False
         options.refine_extra_params = True
         options.refine_sensor_from_rig = True
         options.print_summary = False
-        pycolmap.bundle_adjustment(model, options)
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in model.reg_image_ids():
+            config.add_image(image_id)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        # pycolmap.bundle_adjustment would reset the log level of the whole process.
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     (rig,) = (r for r in model.rigs.values() if r.num_sensors() == 2)
     (sensor_from_rig,) = rig.non_ref_sensors.values()
     return np.array(sensor_from_rig.params)
