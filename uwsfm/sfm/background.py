@@ -40,6 +40,12 @@ def opened(database_path: Path) -> Iterator[pycolmap.Database]:
         yield database
 
 
+def remove_database(path: Path) -> None:
+    """Remove a database with its journals: a stale one would corrupt the next."""
+    for suffix in ("-wal", "-shm", "-journal", ""):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
 def run_watched(
     call: Callable[[pycolmap.CancellationToken], Result], watch: Callable[[], None]
 ) -> Result:

@@ -31,6 +31,7 @@ from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
 
 MIN_FRAMES = 3
+MAX_FRAMES = 500  # each is compared with all the others
 MAX_SPREAD = 0.2
 """Frames that differ more from the median, in radians or as a fraction of the
 baseline, are left out."""
@@ -81,7 +82,7 @@ def rig_from_baseline(
             f"{MIN_FRAMES} are needed to derive cam_from_rig from baseline_m: give "
             "cam_from_rig in rig.yaml"
         )
-    average = robust_average(relative)
+    average = robust_average(relative[:: -(-len(relative) // MAX_FRAMES)])
     adjusted = _adjust(models[0], database_path, frames, average)
     return with_baseline(adjusted, pinholes, rig.baseline_m)
 

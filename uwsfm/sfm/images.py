@@ -60,10 +60,10 @@ class Frames:
         return rows
 
 
-def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """Sorts "frame10" after "frame2"; the name itself breaks ties."""
     parts = re.findall(r"\d+|\D+", name)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], name
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts], name
 
 
 def find_frames(image_dir: Path, rig: Rig) -> Frames:

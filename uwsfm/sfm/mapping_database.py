@@ -21,7 +21,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.sfm.background import opened, run_with_database
+from uwsfm.sfm.background import opened, remove_database, run_with_database
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.pinhole_fit import VirtualPinhole
@@ -93,6 +93,7 @@ def write_mapping_database(
     Raises:
         UwsfmError: no pair of images is left with verified matches.
     """
+    remove_database(mapping_path)
     with replaced_file(mapping_path) as partial:
         with (
             opened(features_path) as source,

@@ -112,8 +112,10 @@ def correct_rotations(
             f"which no tilted port explains; {POSE_HINT}"
         )
     if after > MAX_REST:
-        names = (rig.cameras[i].name for i in (used[0].camera_a, used[0].camera_b))
-        raise misfit_error(*names, after)
+        name_a, name_b = (
+            rig.cameras[index].name for index in (used[0].camera_a, used[0].camera_b)
+        )
+        raise misfit_error(name_a, name_b, after)
     return RigRotation(
         cam_from_rig=poses,
         turn_deg=turn_deg,

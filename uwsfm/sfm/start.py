@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+import uwsfm
 from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
+from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import extract_features, store_intrinsics
 from uwsfm.sfm.images import Frames, check_images, find_frames
@@ -29,7 +31,7 @@ from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
 from uwsfm.sfm.rig_check import check_rig
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import read_same_frame_matches
-from uwsfm.sfm.steps import Steps, remove_database
+from uwsfm.sfm.steps import Steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +154,7 @@ def _match_images(
     """Features and raw matches; neither depends on lenses, ports or poses."""
     sizes = [(c.camera.width, c.camera.height) for c in rig.cameras]
     inputs = [
-        pycolmap.__version__,
+        [uwsfm.__version__, pycolmap.__version__],
         sizes,
         frames.fingerprint(),
         asdict(options.features),

@@ -108,9 +108,3 @@ def _remove_partial_outputs(work_dir: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
-
-
-def remove_database(path: Path) -> None:
-    """Remove a database with its journals: a stale one would corrupt the next."""
-    for suffix in ("-wal", "-shm", "-journal", ""):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)

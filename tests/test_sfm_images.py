@@ -1,0 +1,135 @@
+"""Images that are missing, broken or of the wrong size end in one sentence."""
+
+import cv2
+import numpy as np
+import pytest
+
+from uwsfm.errors import InputError
+from uwsfm.sfm.images import check_images, find_frames, natural_key
+from uwsfm.sfm.options import FeatureOptions, MatchOptions
+from uwsfm.simulate.rigs import sample_rig
+
+WIDTH, HEIGHT = 80, 60
+
+
+@pytest.fixture
+def rig():
+    return sample_rig(image_scale=WIDTH / 800)
+
+
+@pytest.fixture
+def image_dir(tmp_path, rng):
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        for name in ("frame2.png", "frame10.png", "frame1.png"):
+            image = rng.integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+            cv2.imwrite(str(tmp_path / folder / name), image)
+    return tmp_path
+
+
+def sentence(error: pytest.ExceptionInfo) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+def test_frames_are_equal_names_in_natural_order(image_dir, rig):
+    frames = find_frames(image_dir, rig)
+    assert frames.names == ("frame1.png", "frame2.png", "frame10.png")
+    assert frames.image_name(1, 2) == "right/frame10.png"
+    assert frames.warnings() == []
+    check_images(frames, rig)
+
+
+def test_natural_key_sorts_numbers_as_numbers():
+    names = ["b1.png", "a10.png", "a9.png", "10.png", "9.png"]
+    assert sorted(names, key=natural_key) == [
+        "9.png",
+        "10.png",
+        "a9.png",
+        "a10.png",
+        "b1.png",
+    ]
+
+
+def test_unmatched_images_are_counted_not_dropped_silently(image_dir, rig):
+    (image_dir / "left" / "frame2.png").unlink()
+    frames = find_frames(image_dir, rig)
+    assert frames.names == ("frame1.png", "frame10.png")
+    (warning,) = frames.warnings()
+    assert "1 images were left out" in warning
+    assert "right/frame2.png" in warning
+
+
+def test_files_that_are_not_images_are_ignored(image_dir, rig):
+    (image_dir / "left" / "Thumbs.db").write_text("x")
+    (image_dir / "left" / "._frame1.png").write_text("x")
+    frames = find_frames(image_dir, rig)
+    assert len(frames.names) == 3
+    assert frames.unmatched == ()
+
+
+def test_missing_directory_is_named(tmp_path, rig):
+    with pytest.raises(InputError) as error:
+        find_frames(tmp_path / "dive", rig)
+    assert str(tmp_path / "dive") in sentence(error)
+
+
+def test_missing_folder_is_named_with_its_camera(image_dir, rig):
+    (image_dir / "right").rename(image_dir / "starboard")
+    with pytest.raises(InputError) as error:
+        find_frames(image_dir, rig)
+    assert str(image_dir / "right") in sentence(error)
+    assert "'right'" in sentence(error)
+
+
+def test_empty_folder_is_named(image_dir, rig):
+    for path in (image_dir / "right").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match=r"right.* holds no image"):
+        find_frames(image_dir, rig)
+
+
+def test_names_without_a_pair_are_shown_from_each_side(image_dir, rig):
+    for path in (image_dir / "right").iterdir():
+        path.rename(path.with_name(f"R_{path.name}"))
+    with pytest.raises(InputError) as error:
+        find_frames(image_dir, rig)
+    assert "frame1.png" in sentence(error)
+    assert "R_frame1.png" in sentence(error)
+
+
+def test_one_pair_is_not_a_dive(image_dir, rig):
+    for name in ("frame2.png", "frame10.png"):
+        (image_dir / "left" / name).unlink()
+    with pytest.raises(InputError, match=r"only one frame \(frame1.png\)"):
+        find_frames(image_dir, rig)
+
+
+def test_white_space_in_a_name_is_refused(image_dir, rig):
+    for folder in ("left", "right"):
+        path = image_dir / folder / "frame2.png"
+        path.rename(path.with_name("frame 2.png"))
+    with pytest.raises(InputError, match=r"frame 2.png: its name contains white"):
+        find_frames(image_dir, rig)
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
+def test_image_that_cannot_be_decoded_is_named(image_dir, rig, content):
+    (image_dir / "right" / "frame2.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"right.frame2.png cannot be read"):
+        check_images(find_frames(image_dir, rig), rig)
+
+
+def test_image_of_another_size_is_named_with_both_sizes(image_dir, rig):
+    path = image_dir / "left" / "frame10.png"
+    cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH // 2), dtype=np.uint8))
+    with pytest.raises(InputError, match=r"left.frame10.png has 40 x 60 .* 80 x 60"):
+        check_images(find_frames(image_dir, rig), rig)
+
+
+def test_options_refuse_what_they_cannot_do(tmp_path):
+    with pytest.raises(InputError, match="mask directory"):
+        FeatureOptions(mask_dir=tmp_path / "nowhere")
+    with pytest.raises(InputError, match="'random'"):
+        MatchOptions(strategy="random")  # type: ignore[arg-type]

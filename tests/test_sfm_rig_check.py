@@ -1,0 +1,154 @@
+"""A rig that contradicts its images is refused, and the sentence says what to change.
+
+Observations are simulated: the true ports are tilted, the rig file knows straight ones.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_scenes import same_frame_matches, simulated_dive
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.rig import Rig
+from uwsfm.sfm.rig_check import check_rig
+from uwsfm.sfm.rig_rotation import correct_rotations, scene_depths
+from uwsfm.sfm.same_frame import PairMatches
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
+
+
+@pytest.fixture(scope="module")
+def dive():
+    return simulated_dive()
+
+
+@pytest.fixture(scope="module")
+def pair(dive) -> PairMatches:
+    return same_frame_matches(dive.scene)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return nominal_rig(sample_rig())
+
+
+def poses_of(rig: Rig) -> np.ndarray:
+    assert rig.cam_from_rig is not None
+    return np.array(rig.cam_from_rig)
+
+
+def refusal(rig: Rig, poses: np.ndarray, pair: PairMatches) -> str:
+    with pytest.raises(InputError) as error:
+        check_rig(rig, poses, [pair])
+        correct_rotations(rig, poses, [pair])
+    text = str(error.value)
+    assert "'right'" in text
+    assert "\n" not in text
+    return text
+
+
+def test_a_right_rig_passes_though_its_ports_are_tilted(rig, pair):
+    check_rig(rig, poses_of(rig), [pair])
+
+
+def test_swapped_images_are_recognised(rig, pair):
+    swapped = replace(pair, xy_a=pair.xy_b, xy_b=pair.xy_a)
+    text = refusal(rig, poses_of(rig), swapped)
+    assert "the image folders 'left' and 'right' are swapped" in text
+    assert "0%" in text
+
+
+def test_inverted_pose_is_recognised(rig, pair):
+    poses = poses_of(rig)
+    poses[1] = rigid3.inverse(poses[1])
+    assert "cam_from_rig of 'right' is inverted" in refusal(rig, poses, pair)
+
+
+def test_position_instead_of_translation_is_recognised(rig, pair):
+    poses = poses_of(rig)
+    poses[1, 4:] = rigid3.inverse(poses[1])[4:]
+    text = refusal(rig, poses, pair)
+    assert "translation_m of 'right' is the position of the camera" in text
+
+
+def test_explanations_that_fit_worse_are_not_named(pair):
+    """Toed-in cameras tell an inverted rig from swapped folders."""
+    toed_in = nominal_rig(sample_rig())
+    poses = poses_of(toed_in)
+    poses[1] = rigid3.inverse(poses[1])
+    text = refusal(toed_in, poses, pair)
+    assert "swapped" not in text
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("angle_deg", [8.0, 30.0, 90.0])
+def test_a_wrong_rotation_is_refused(rig, pair, axis, angle_deg):
+    poses = poses_of(rig)
+    turn = np.zeros(6)
+    turn[axis] = np.radians(angle_deg)
+    poses[1] = rigid3.perturb(poses[1], turn)
+    refusal(rig, poses, pair)
+
+
+def test_quaternion_in_the_order_wxyz_is_refused(rig, pair):
+    poses = poses_of(rig)
+    poses[1, :4] = np.roll(poses[1, :4], 1)
+    refusal(rig, poses, pair)
+
+
+def test_baseline_along_another_axis_is_refused(rig, pair):
+    poses = poses_of(rig)
+    poses[1, 4:] = np.roll(poses[1, 4:], 1)
+    refusal(rig, poses, pair)
+
+
+def test_too_few_matches_are_counted(rig, pair):
+    few = PairMatches(
+        camera_a=0,
+        camera_b=1,
+        frame_idx=pair.frame_idx[:7],
+        xy_a=pair.xy_a[:7],
+        xy_b=pair.xy_b[:7],
+    )
+    assert "share only 7 matches" in refusal(rig, poses_of(rig), few)
+
+
+def test_turns_make_the_rays_meet(rig, pair):
+    """Tilts of 2 and 1 degrees: several pixels before, the noise after."""
+    found = correct_rotations(rig, poses_of(rig), [pair])
+    focal_px = 620.0 * 1.333
+    assert found.misfit_before * focal_px > 2.0
+    assert found.misfit_after * focal_px < 0.5
+    assert found.turn_deg[0] == 0.0
+    assert 0.2 < found.turn_deg[1] < 0.8
+    assert found.warnings(rig) == []
+
+
+def test_turns_keep_the_camera_centres(rig, pair):
+    found = correct_rotations(rig, poses_of(rig), [pair]).cam_from_rig
+    np.testing.assert_allclose(
+        rigid3.inverse(found)[:, 4:], rigid3.inverse(poses_of(rig))[:, 4:], atol=1e-12
+    )
+
+
+def test_a_notable_turn_is_reported(rig, pair):
+    poses = poses_of(rig)
+    poses[1] = rigid3.perturb(poses[1], np.radians([3.0, 0, 0, 0, 0, 0]))
+    (warning,) = correct_rotations(rig, poses, [pair]).warnings(rig)
+    assert "'right'" in warning
+
+
+def test_depths_are_those_of_the_scene(rig, dive, pair):
+    """Within a few percent, though ports and rotations are only approximate."""
+    poses = correct_rotations(rig, poses_of(rig), [pair]).cam_from_rig
+    depths = scene_depths(rig, poses, [pair])
+    truth = dive.truth
+    for camera in (0, 1):
+        seen = truth.camera_idx == camera
+        cam_from_world = rigid3.compose(
+            truth.cam_from_rig[camera], truth.rig_from_world[truth.frame_idx[seen]]
+        )
+        in_cam = rigid3.transform(cam_from_world, truth.points[truth.point_idx[seen]])
+        expected = np.percentile(in_cam[:, 2], [10, 50, 90])
+        np.testing.assert_allclose(depths[camera], expected, rtol=0.1)

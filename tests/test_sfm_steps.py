@@ -1,0 +1,112 @@
+"""Finished steps are skipped, interrupted ones go on, changed ones start again."""
+
+import pytest
+
+from uwsfm.sfm.background import remove_database
+from uwsfm.sfm.steps import Steps
+
+
+class Recorder:
+    """A chain of two steps that counts what is done."""
+
+    def __init__(self, work_dir):
+        self.work_dir = work_dir
+        self.done: list[str] = []
+
+    def run(self, first="a", second="b", fails=""):
+        steps = Steps(self.work_dir)
+        key = steps.run(
+            "first",
+            first,
+            lambda: self.act("first", fails),
+            outputs=[self.work_dir / "first"],
+            clear=lambda: self.done.append("clear first"),
+        )
+        steps.run(
+            "second",
+            [key, second],
+            lambda: self.act("second", fails),
+            outputs=[self.work_dir / "second"],
+        )
+        return steps
+
+    def act(self, name, fails):
+        self.done.append(name)
+        if fails == name:
+            raise KeyboardInterrupt
+        (self.work_dir / name).write_text(name)
+
+    def take(self):
+        done, self.done = self.done, []
+        return done
+
+
+@pytest.fixture
+def chain(tmp_path):
+    chain = Recorder(tmp_path / "work")
+    chain.run()
+    assert chain.take() == ["clear first", "first", "second"]
+    return chain
+
+
+def test_finished_steps_are_skipped(chain):
+    steps = chain.run()
+    assert chain.take() == []
+    assert set(steps.seconds()) == {"first", "second"}
+
+
+def test_changed_inputs_restart_from_their_step(chain):
+    chain.run(second="c")
+    assert chain.take() == ["second"]
+    chain.run(first="c", second="c")
+    assert chain.take() == ["clear first", "first", "second"]
+
+
+def test_inputs_that_come_back_are_not_taken_for_done(chain):
+    chain.run(first="c")
+    chain.take()
+    chain.run(first="a")
+    assert chain.take() == ["clear first", "first", "second"]
+
+
+def test_an_interrupted_step_goes_on_from_what_it_left(chain):
+    with pytest.raises(KeyboardInterrupt):
+        chain.run(first="c", fails="first")
+    chain.take()
+    chain.run(first="c")
+    assert chain.take() == ["first", "second"]  # nothing was cleared
+
+
+def test_an_interrupted_step_starts_again_when_its_inputs_change(chain):
+    with pytest.raises(KeyboardInterrupt):
+        chain.run(first="c", fails="first")
+    chain.take()
+    chain.run(first="d")
+    assert chain.take() == ["clear first", "first", "second"]
+
+
+def test_missing_outputs_are_made_again_with_all_that_follows(chain):
+    (chain.work_dir / "first").unlink()
+    chain.run()
+    assert chain.take() == ["clear first", "first", "second"]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"format": 0}'])
+def test_a_record_that_cannot_be_read_means_that_nothing_is_done(chain, content):
+    (chain.work_dir / "steps.json").write_text(content)
+    chain.run()
+    assert chain.take() == ["clear first", "first", "second"]
+
+
+def test_half_written_outputs_of_a_killed_run_are_removed(chain):
+    (chain.work_dir / ".mapping.x1.db").write_text("half")
+    (chain.work_dir / ".perspective.x2").mkdir()
+    chain.run()
+    assert not list(chain.work_dir.glob(".*"))
+
+
+def test_a_database_is_removed_with_its_journals(tmp_path):
+    for name in ("a.db", "a.db-wal", "a.db-shm", "b.db"):
+        (tmp_path / name).write_text("x")
+    remove_database(tmp_path / "a.db")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.db"]
