@@ -3,20 +3,11 @@
 The public names are imported on first use, so that ``import uwsfm`` costs nothing.
 """
 
-import sys
-
-if (
-    sys.platform == "linux"
-    and "pycolmap" in sys.modules
-    and "zlib" not in {*sys.modules, *sys.builtin_module_names}
-):
-    # pycolmap 4.2 exports a zlib of its own: Python's, if it is loaded afterwards,
-    # frees the other's memory and aborts the process at its first compression.
-    raise ImportError("import uwsfm before pycolmap: the other order aborts in zlib")
-
 import logging
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING
+
+from uwsfm._load_order import refuse_broken_zlib
 
 if TYPE_CHECKING:
     from uwsfm.calibration.bundle_adjustment import calibrate
@@ -32,6 +23,8 @@ if TYPE_CHECKING:
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
+
+refuse_broken_zlib()
 
 __version__ = metadata.version("uwsfm")
 logger = logging.getLogger("uwsfm")
