@@ -7,6 +7,7 @@ import pytest
 from dense import dense_system, small_scene
 
 from uwsfm import CalibrateOptions, calibrate
+from uwsfm.calibration.uncertainty import camera_variances
 from uwsfm.simulate import perturbed
 from uwsfm.solver import levenberg_marquardt as lm
 from uwsfm.solver.covariance import point_covariances, reduced_covariance
@@ -108,20 +109,25 @@ def test_stddevs_of_a_camera_are_read_from_the_right_columns():
     options = {"refine_normals": (True, False), "refine_distances": (False, True)}
     result = calibrate(truth, loss="l2", **options)
     covariance = result.covariance
-    left, right = covariance.cameras
     # Normal of the left; then rotation, direction and port distance of the right.
     assert covariance.border_cols[0].tolist() == [HELD] * 6 + [0, 1, HELD, HELD]
     expected = [2, 3, 4, 5, 6, HELD, HELD, HELD, 7, HELD]
     assert covariance.border_cols[1].tolist() == expected
     variance = np.diag(covariance.border)
-    assert left.normal_stddev_deg == pytest.approx(
-        np.degrees(np.sqrt(variance[0] + variance[1]))
+    left, right = (
+        camera_variances(covariance.border, cols, pose)
+        for cols, pose in zip(
+            covariance.border_cols, result.scene.cam_from_rig, strict=True
+        )
     )
-    assert left.distance_stddev_m == right.normal_stddev_deg == 0.0
-    assert right.distance_stddev_m == pytest.approx(np.sqrt(variance[7]))
-    assert right.rotation_stddev_deg == pytest.approx(
-        np.degrees(np.sqrt(variance[2:5].sum()))
-    )
+    normal, distance, rotation = 0, 1, 2
+    assert left[normal] == pytest.approx(variance[0] + variance[1])
+    assert left[distance] == right[normal] == 0.0
+    assert right[distance] == pytest.approx(variance[7])
+    assert right[rotation] == pytest.approx(variance[2:5].sum())
     # The length is held: the translation varies on a sphere, across itself.
-    total = np.sqrt(np.sum(np.square(right.translation_stddev_m)))
-    assert total == pytest.approx(0.2 * np.sqrt(variance[5:7].sum()))
+    assert right[3:].sum() == pytest.approx(0.2**2 * variance[5:7].sum())
+    # What is reported is never less than what independent noise does.
+    reported = covariance.cameras[1]
+    assert reported.distance_stddev_m >= np.sqrt(variance[7])
+    assert covariance.cameras[0].distance_stddev_m == 0.0

@@ -8,7 +8,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.models.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.baseline import robust_average, with_baseline
-from uwsfm.sfm.mapping_database import real_rig, virtual_rig
+from uwsfm.sfm.mapping_database import virtual_rig
 from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
 from uwsfm.simulate.rigs import tilted_normal
 
@@ -115,12 +115,6 @@ def test_virtual_rig_sees_points_from_the_virtual_centres(rng):
     np.testing.assert_allclose(
         rigid3.transform(virtual[1], in_virtual_rig), expected, atol=1e-15
     )
-
-
-def test_real_rig_inverts_virtual_rig(rng):
-    poses, pinholes = rig_and_pinholes(rng)
-    back = real_rig(virtual_rig(poses, pinholes), pinholes)
-    np.testing.assert_allclose(back, poses, atol=1e-15)
 
 
 def test_baseline_length_gives_the_unit_of_a_virtual_rig(rng):

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from sfm_scenes import same_frame_matches, simulated_dive
+
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.rig import Rig
-from uwsfm.sfm.rig_check import check_rig
-from uwsfm.sfm.rig_rotation import correct_rotations, scene_depths
+from uwsfm.sfm.rig_check import check_rig, check_rotation
+from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
-from uwsfm.simulate.rigs import nominal_rig, sample_rig
+from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,14 @@ def poses_of(rig: Rig) -> np.ndarray:
     return np.array(rig.cam_from_rig)
 
 
+def turned(rig: Rig, poses: np.ndarray, pair: PairMatches) -> RigRotation:
+    return correct_rotations(rig.refractive_cameras(), poses, [pair])
+
+
 def refusal(rig: Rig, poses: np.ndarray, pair: PairMatches) -> str:
     with pytest.raises(InputError) as error:
         check_rig(rig, poses, [pair])
-        correct_rotations(rig, poses, [pair])
+        check_rotation(rig, turned(rig, poses, pair), [pair])
     text = str(error.value)
     assert "'right'" in text
     assert "\n" not in text
@@ -72,13 +76,29 @@ def test_position_instead_of_translation_is_recognised(rig, pair):
     assert "translation_m of 'right' is the position of the camera" in text
 
 
-def test_explanations_that_fit_worse_are_not_named(pair):
-    """Toed-in cameras tell an inverted rig from swapped folders."""
-    toed_in = nominal_rig(sample_rig())
-    poses = poses_of(toed_in)
+def test_different_lenses_leave_one_explanation(rig, pair):
+    """Each wrong explanation would need turns that no tilted port causes."""
+    poses = poses_of(rig)
+    swapped = replace(pair, xy_a=pair.xy_b, xy_b=pair.xy_a)
+    text = refusal(rig, poses, swapped)
+    assert "position" not in text
+    assert "inverted" not in text
     poses[1] = rigid3.inverse(poses[1])
-    text = refusal(toed_in, poses, pair)
+    text = refusal(rig, poses, pair)
     assert "swapped" not in text
+    assert "position" not in text
+
+
+def test_equal_lenses_leave_several_explanations():
+    """Swapped images of one lens are those of the inverted rig: both are said."""
+    lens = sample_rig().cameras[0].camera
+    twins = stereo_rig((lens, lens), right_rotvec_deg=(0.6, 1.9, -0.8))
+    matches = same_frame_matches(simulated_dive(twins).scene)
+    swapped = replace(matches, xy_a=matches.xy_b, xy_b=matches.xy_a)
+    given = nominal_rig(twins)
+    text = refusal(given, poses_of(given), swapped)
+    assert "swapped" in text
+    assert "inverted" in text
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -116,7 +136,7 @@ def test_too_few_matches_are_counted(rig, pair):
 
 def test_turns_make_the_rays_meet(rig, pair):
     """Tilts of 2 and 1 degrees: several pixels before, the noise after."""
-    found = correct_rotations(rig, poses_of(rig), [pair])
+    found = turned(rig, poses_of(rig), pair)
     focal_px = 620.0 * 1.333
     assert found.misfit_before * focal_px > 2.0
     assert found.misfit_after * focal_px < 0.5
@@ -126,7 +146,7 @@ def test_turns_make_the_rays_meet(rig, pair):
 
 
 def test_turns_keep_the_camera_centres(rig, pair):
-    found = correct_rotations(rig, poses_of(rig), [pair]).cam_from_rig
+    found = turned(rig, poses_of(rig), pair).cam_from_rig
     np.testing.assert_allclose(
         rigid3.inverse(found)[:, 4:], rigid3.inverse(poses_of(rig))[:, 4:], atol=1e-12
     )
@@ -135,14 +155,14 @@ def test_turns_keep_the_camera_centres(rig, pair):
 def test_a_notable_turn_is_reported(rig, pair):
     poses = poses_of(rig)
     poses[1] = rigid3.perturb(poses[1], np.radians([3.0, 0, 0, 0, 0, 0]))
-    (warning,) = correct_rotations(rig, poses, [pair]).warnings(rig)
+    (warning,) = turned(rig, poses, pair).warnings(rig)
     assert "'right'" in warning
 
 
 def test_depths_are_those_of_the_scene(rig, dive, pair):
     """Within a few percent, though ports and rotations are only approximate."""
-    poses = correct_rotations(rig, poses_of(rig), [pair]).cam_from_rig
-    depths = scene_depths(rig, poses, [pair])
+    poses = turned(rig, poses_of(rig), pair).cam_from_rig
+    depths = scene_depths(rig.refractive_cameras(), poses, [pair])
     truth = dive.truth
     for camera in (0, 1):
         seen = truth.camera_idx == camera

@@ -16,25 +16,22 @@ from uwsfm.calibration.problem import (
     CalibrateOptions,
     CalibrateSummary,
     CalibrationResult,
-    CameraCovariance,
     Covariance,
 )
+from uwsfm.calibration.uncertainty import Optimum, posterior_covariance
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver.covariance import point_covariances, reduced_covariance
 from uwsfm.solver.layout import HELD, Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import (
     LengthPriors,
     LevenbergMarquardtOptions,
     LevenbergMarquardtResult,
-    Problem,
     Report,
     Stop,
     minimize,
 )
-from uwsfm.solver.state import State, translation_arm
+from uwsfm.solver.state import State
 
 # Median of the squared length of a 2-D standard normal vector.
 MEDIAN_CHI2_2 = 2.0 * float(np.log(2.0))
@@ -260,42 +257,18 @@ def _summary(run: _Run, solved: _Solved, seconds: float) -> CalibrateSummary:
 
 
 def _covariance(run: _Run, solved: _Solved, sigma_px: float) -> Covariance:
-    # The solve weighed the priors against a guess of the noise; now it is known.
-    options, columns = LevenbergMarquardtOptions(loss="l2"), run.columns
-    problem = Problem(solved.layout, options, run.priors(sigma_px))
-    eqs = problem.linearize(solved.part)
-    reduced = reduced_covariance(solved.layout, eqs)
-    variance = sigma_px**2
-    border = variance * reduced.border(solved.layout)
-    points = np.full((len(solved.state.points), 3, 3), np.nan)
-    points[solved.used] = variance * point_covariances(solved.layout, eqs, reduced)
-    return Covariance(
-        border=border,
-        border_cols=columns,
-        frames=variance * reduced.frames(solved.layout),
-        points=points,
-        cameras=tuple(
-            _camera_covariance(border, cols, pose, bool(at_zero))
-            for cols, pose, at_zero in zip(
-                columns, solved.state.cam_from_rig, run.at_zero, strict=True
-            )
-        ),
-        determined=reduced.determined,
-    )
-
-
-def _camera_covariance(
-    border: Array, cols: IndexArray, cam_from_rig: Array, at_zero: bool
-) -> CameraCovariance:
-    padded = np.zeros((len(border) + 1, len(border) + 1))
-    padded[:-1, :-1] = border  # HELD = -1 reads the zeros at the end
-    block = padded[np.ix_(cols, cols)]
-    arm = translation_arm(cam_from_rig[4:]).reshape(3, 3)
-    translation = np.einsum("ka,kl,la->a", arm, block[3:6, 3:6], arm)
-    return CameraCovariance(
-        normal_stddev_deg=float(np.degrees(np.sqrt(np.trace(block[6:8, 6:8])))),
-        distance_stddev_m=float(np.sqrt(block[8, 8])),
-        rotation_stddev_deg=float(np.degrees(np.sqrt(np.trace(block[:3, :3])))),
-        translation_stddev_m=tuple(np.sqrt(translation).tolist()),
-        distance_at_zero=at_zero,
+    return posterior_covariance(
+        Optimum(
+            layout=solved.layout,
+            state=solved.part,
+            used=solved.used,
+            num_points=len(solved.state.points),
+            columns=run.columns,
+            at_zero=run.at_zero,
+            # The solve weighed the priors against a guess of the noise.
+            priors=run.priors(sigma_px),
+            sigma_px=sigma_px,
+            image_sizes=np.array([(c.width, c.height) for c in run.scene.cameras]),
+            degrees_of_freedom=solved.degrees_of_freedom,
+        )
     )

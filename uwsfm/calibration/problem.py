@@ -86,7 +86,13 @@ def _per_camera(name: str, value: PerCamera, count: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraCovariance:
-    """Standard deviations of one camera's housing; 0 means held, NaN undetermined."""
+    """Standard deviations of one camera's housing; 0 means held, NaN undetermined.
+
+    Each is the larger of two: that of `Covariance.border`, where every observation errs
+    alone, and that where the observations of a quarter of an image may err together, by
+    as much as their residuals show. On real images the second is up to three times the
+    first.
+    """
 
     normal_stddev_deg: float
     """Root mean square angle between the estimated and the true normal."""
@@ -110,7 +116,7 @@ class Covariance:
     """
 
     border: Array
-    """(B, B), marginal over poses and points."""
+    """(B, B), marginal over poses and points, if every observation errs alone."""
     border_cols: IndexArray
     """(C, 10) column of each parameter of each camera, -1 if held."""
     frames: Array

@@ -15,6 +15,8 @@ from uwsfm.sfm.background import opened, run_with_database
 from uwsfm.sfm.images import Frames, read_gray
 from uwsfm.sfm.options import FeatureOptions
 
+ENHANCED = "clahe"  # folder of the enhanced copies, beside the database
+
 
 def extract_features(
     frames: Frames,
@@ -40,7 +42,7 @@ def extract_features(
     """
     image_dir = frames.image_dir
     if options.clahe:
-        image_dir = database_path.parent / "clahe"
+        image_dir = database_path.parent / ENHANCED
         write_enhanced(frames, image_dir, progress)
     database_path.parent.mkdir(parents=True, exist_ok=True)
     total = len(frames.folders) * len(frames.names)
@@ -116,6 +118,8 @@ def _extraction_options(
     extraction.sift.first_octave = -1 if small else 0
     extraction.sift.peak_threshold = options.peak_threshold
     extraction.sift.max_num_features = options.max_num_features
+    # A second orientation is the same position again: no second measurement.
+    extraction.sift.max_num_orientations = 1
     return extraction
 
 

@@ -52,12 +52,9 @@ class Frames:
         ]
 
     def fingerprint(self) -> list[Any]:
-        """Names, sizes and times of the images: what a change of them would change."""
-        rows: list[Any] = [list(self.folders)]
-        for name in self.image_names():
-            stat = (self.image_dir / name).stat()
-            rows.append([name, stat.st_size, stat.st_mtime_ns])
-        return rows
+        """Names, sizes and times of the images, whichever camera comes first."""
+        stats = {n: (self.image_dir / n).stat() for n in sorted(self.image_names())}
+        return [[n, stat.st_size, stat.st_mtime_ns] for n, stat in stats.items()]
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:

@@ -55,16 +55,6 @@ def virtual_rig(cam_from_rig: Array, pinholes: Sequence[VirtualPinhole]) -> Arra
     return poses
 
 
-def real_rig(virtual_cam_from_rig: Array, pinholes: Sequence[VirtualPinhole]) -> Array:
-    """Poses (C, 7) of the real cameras: the inverse of `virtual_rig`."""
-    shifts = np.stack([p.virtual_from_cam for p in pinholes])
-    poses = rigid3.compose(
-        rigid3.inverse(shifts), rigid3.compose(virtual_cam_from_rig, shifts[:1])
-    )
-    poses[0] = rigid3.IDENTITY
-    return poses
-
-
 def write_mapping_database(
     features_path: Path,
     mapping_path: Path,
@@ -158,11 +148,15 @@ def _copy(
             target.write_image(image, use_image_id=True)
             target.write_keypoints(image_id, virtual.astype(np.float32))
     for pair_id, matches in zip(*source.read_all_matches(), strict=True):
-        id_a, id_b = pycolmap.pair_id_to_image_pair(pair_id)
-        if len(matches) == 0 or id_a not in new_id or id_b not in new_id:
+        old_a, old_b = pycolmap.pair_id_to_image_pair(pair_id)
+        if len(matches) == 0 or old_a not in new_id or old_b not in new_id:
             continue
-        good = has_ray[id_a][matches[:, 0]] & has_ray[id_b][matches[:, 1]]
-        target.write_matches(new_id[id_a], new_id[id_b], matches[good])
+        good = has_ray[old_a][matches[:, 0]] & has_ray[old_b][matches[:, 1]]
+        ids, matches = (new_id[old_a], new_id[old_b]), matches[good]
+        if ids[0] > ids[1]:
+            ids, matches = ids[::-1], np.ascontiguousarray(matches[:, ::-1])
+        # Sorted: RANSAC draws rows, and theirs depends on the old identifiers.
+        target.write_matches(*ids, matches[np.argsort(matches[:, 0], kind="stable")])
 
 
 def rig_config(frames: Frames, cam_from_rig: Array) -> pycolmap.RigConfig:

@@ -24,7 +24,7 @@ class FeatureOptions:
     peak_threshold: float = 0.005
     """Least contrast. COLMAP's 0.0067 finds less than half as many features in water;
     0.003 finds three times more, but noisier ones at three times the cost."""
-    max_num_features: int = 2048
+    max_num_features: int = 4096
     """Per image, about; the largest are kept. Twice as many cost twice the time, and
     make the errors of a housing a third smaller."""
     max_upsampled_px: int = 2_000_000

@@ -7,7 +7,6 @@ with a plausible error: only the points that both cameras see in one frame tell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,49 +15,23 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
+from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, RigRotation, correct_rotations
 from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
 
-MIN_RIG_MATCHES = 30
-"""Over all frames; a pair of cameras with fewer is not judged."""
 MIN_IN_FRONT = 0.5
 CLEARLY_IN_FRONT = 0.8
-SAME_MISFIT = 1.5
-"""Two explanations whose misfits differ by less than this factor are not told apart."""
 MAX_MISFIT = 0.05
 """Radians: about 3 degrees. A port tilted by 8 degrees bends the rays by 2."""
-
+MAX_TURN_DEG = 5.0
+"""A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
+MAX_REST = 5e-3
+"""Radians that no turn explains, median: a wrong direction of the baseline."""
+SAME_TURN_DEG = 0.75
+"""Tilted ports turn rays by so much: explanations closer than that are both named."""
 POSE_HINT = (
     "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
     "the axes of translation_m"
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairFit:
-    """How well matches fit two cameras at a relative pose."""
-
-    in_front: float
-    """Fraction of the points in front of both cameras."""
-    misfit: float
-    """Median angle by which rays miss their epipolar plane, radians."""
-
-    @property
-    def explains(self) -> bool:
-        return self.in_front >= CLEARLY_IN_FRONT and self.misfit <= MAX_MISFIT
-
-
-def fit_of(
-    camera_a: RefractiveCamera,
-    camera_b: RefractiveCamera,
-    b_from_a: Array,
-    xy_a: Array,
-    xy_b: Array,
-) -> PairFit:
-    """Cheirality and epipolar misfit of matched pixels (N, 2); no ray counts as bad."""
-    rays = ray_pairs(camera_a, camera_b, b_from_a, xy_a, xy_b)
-    _, in_front = rays.triangulate()
-    angles = np.abs(np.nan_to_num(rays.epipolar_angles(), nan=np.pi / 2))
-    return PairFit(in_front=float(np.mean(in_front)), misfit=float(np.median(angles)))
 
 
 def check_rig(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> None:
@@ -81,28 +54,69 @@ def check_rig(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> No
             continue
         a, b = pair.camera_a, pair.camera_b
         b_from_a = relative_pose(cam_from_rig, a, b)
-        given = fit_of(cameras[a], cameras[b], b_from_a, pair.xy_a, pair.xy_b)
-        if given.in_front >= MIN_IN_FRONT and given.misfit <= MAX_MISFIT:
+        in_front, misfit = fit_of(
+            cameras[a], cameras[b], b_from_a, pair.xy_a, pair.xy_b
+        )
+        if in_front >= MIN_IN_FRONT and misfit <= MAX_MISFIT:
             continue
         names = rig.cameras[a].name, rig.cameras[b].name
-        folders = rig.cameras[a].images, rig.cameras[b].images
-        remedies = _remedies(cameras[a], cameras[b], b_from_a, pair, names, folders)
+        remedies = _remedies(rig, pair, b_from_a)
         if remedies:
             raise InputError(
                 f"cameras {names[0]!r} and {names[1]!r} contradict their images: as "
-                f"described, only {given.in_front:.0%} of the points that both see lie "
-                f"in front of them; probably {' or '.join(remedies)}"
+                f"described, only {in_front:.0%} of the points that both see lie in "
+                f"front of them; probably {' or '.join(remedies)}"
             )
-        if given.in_front < MIN_IN_FRONT:
+        if in_front < MIN_IN_FRONT:
             raise InputError(
-                f"only {given.in_front:.0%} of the points that cameras {names[0]!r} "
-                f"and {names[1]!r} both see lie in front of them: check cam_from_rig of"
-                f" {names[1]!r} (x_in_cam = R x_in_rig + translation_m)"
+                f"only {in_front:.0%} of the points that cameras {names[0]!r} and "
+                f"{names[1]!r} both see lie in front of them: check cam_from_rig of "
+                f"{names[1]!r} (x_in_cam = R x_in_rig + translation_m)"
             )
-        raise misfit_error(names[0], names[1], given.misfit)
+        raise _misfit_error(*names, misfit)
 
 
-def misfit_error(name_a: str, name_b: str, misfit: float) -> InputError:
+def check_rotation(
+    rig: Rig, rotation: RigRotation, pairs: Sequence[PairMatches]
+) -> None:
+    """Refuse a rig that needs more than tilted ports could explain.
+
+    Raises:
+        InputError: names the camera.
+    """
+    worst = int(rotation.turn_deg.argmax())
+    if rotation.turn_deg[worst] > MAX_TURN_DEG:
+        raise InputError(
+            f"cam_from_rig of camera {rig.cameras[worst].name!r} does not fit the "
+            f"images: it would have to turn by {rotation.turn_deg[worst]:.0f} degrees "
+            f"or more, which no tilted port explains; {POSE_HINT}"
+        )
+    if rotation.misfit_after > MAX_REST:
+        pair = max(pairs, key=len)
+        names = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
+        raise _misfit_error(*names, rotation.misfit_after)
+
+
+def fit_of(
+    camera_a: RefractiveCamera,
+    camera_b: RefractiveCamera,
+    b_from_a: Array,
+    xy_a: Array,
+    xy_b: Array,
+) -> tuple[float, float]:
+    """How well matched pixels (N, 2) fit two cameras at a relative pose (7,).
+
+    Returns:
+        The fraction of the points in front of both cameras, and the median angle by
+        which rays miss their epipolar plane, radians. A pixel without a ray fits badly.
+    """
+    rays = ray_pairs(camera_a, camera_b, b_from_a, xy_a, xy_b)
+    _, in_front = rays.triangulate()
+    angles = np.abs(np.nan_to_num(rays.epipolar_angles(), nan=np.pi / 2))
+    return float(np.mean(in_front)), float(np.median(angles))
+
+
+def _misfit_error(name_a: str, name_b: str, misfit: float) -> InputError:
     """A rotation, or a direction of the baseline, that is grossly wrong."""
     return InputError(
         f"cam_from_rig of camera {name_b!r} is wrong by several degrees: rays of the "
@@ -122,35 +136,55 @@ def _check_counts(rig: Rig, pairs: Sequence[PairMatches]) -> None:
         )
 
 
-def _remedies(
+def _remedies(rig: Rig, pair: PairMatches, b_from_a: Array) -> list[str]:
+    """What to change, one phrase each: the explanations that tilted ports allow."""
+    a, b = rig.cameras[pair.camera_a], rig.cameras[pair.camera_b]
+    given = pair.xy_a, pair.xy_b
+    ideas = {
+        f"the image folders {a.images!r} and {b.images!r} are swapped: exchange them "
+        "in rig.yaml": (b_from_a, given[::-1])
+    }
+    if pair.camera_a == 0:  # the pose of a camera in the rig, not a relative one
+        ideas[
+            f"cam_from_rig of {b.name!r} is inverted: it must map from the rig to the "
+            "camera (x_in_cam = R x_in_rig + translation_m)"
+        ] = (rigid3.inverse(b_from_a), given)
+        as_position = b_from_a.copy()
+        as_position[4:] = -rigid3.rotate(b_from_a, b_from_a[4:])
+        ideas[
+            f"translation_m of {b.name!r} is the position of the camera: it must be "
+            "-R times that"
+        ] = (as_position, given)
+    cameras = rig.refractive_cameras()
+    turns = {
+        phrase: _turn_needed(
+            cameras[pair.camera_a], cameras[pair.camera_b], pose, *pixels
+        )
+        for phrase, (pose, pixels) in ideas.items()
+    }
+    likely = sorted(turns, key=lambda phrase: turns[phrase])
+    limit = min(MAX_TURN_DEG, turns[likely[0]] + SAME_TURN_DEG)
+    return [phrase for phrase in likely if turns[phrase] <= limit]
+
+
+def _turn_needed(
     camera_a: RefractiveCamera,
     camera_b: RefractiveCamera,
     b_from_a: Array,
-    pair: PairMatches,
-    names: tuple[str, str],
-    folders: tuple[str, str],
-) -> list[str]:
-    """What to change, one phrase each: every change that fits about as well as any."""
-    inverse = rigid3.inverse(b_from_a)
-    as_position = b_from_a.copy()
-    as_position[4:] = -rigid3.rotate(b_from_a, b_from_a[4:])
-    xy_a, xy_b = pair.xy_a, pair.xy_b
-    fits = {
-        f"the image folders {folders[0]!r} and {folders[1]!r} are swapped: exchange "
-        "them in rig.yaml": fit_of(camera_a, camera_b, b_from_a, xy_b, xy_a)
-    }
-    if pair.camera_a == 0:  # the pose of a camera in the rig, not a relative one
-        fits[
-            f"cam_from_rig of {names[1]!r} is inverted: it must map from the rig to "
-            "the camera (x_in_cam = R x_in_rig + translation_m)"
-        ] = fit_of(camera_a, camera_b, inverse, xy_a, xy_b)
-        fits[
-            f"translation_m of {names[1]!r} is the position of the camera: it must be "
-            "-R times that"
-        ] = fit_of(camera_a, camera_b, as_position, xy_a, xy_b)
-    good = {phrase: fit for phrase, fit in fits.items() if fit.explains}
-    if not good:
-        return []
-    limit = SAME_MISFIT * min(fit.misfit for fit in good.values())
-    likely = sorted(good, key=lambda phrase: good[phrase].misfit)
-    return [phrase for phrase in likely if good[phrase].misfit <= limit]
+    xy_a: Array,
+    xy_b: Array,
+) -> float:
+    """By how many degrees the second camera must turn to fit; inf if it never does."""
+    in_front, misfit = fit_of(camera_a, camera_b, b_from_a, xy_a, xy_b)
+    if in_front < CLEARLY_IN_FRONT or misfit > MAX_MISFIT:
+        return np.inf
+    pair = PairMatches(
+        camera_a=0,
+        camera_b=1,
+        frame_idx=np.zeros(len(xy_a), dtype=np.int64),
+        xy_a=xy_a,
+        xy_b=xy_b,
+    )
+    poses = np.stack([rigid3.IDENTITY, b_from_a])
+    rotation = correct_rotations((camera_a, camera_b), poses, [pair])
+    return float(rotation.turn_deg[1]) if rotation.misfit_after <= MAX_REST else np.inf

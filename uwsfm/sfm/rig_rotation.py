@@ -8,28 +8,25 @@ does not fit its own images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
-from uwsfm.sfm.rig_check import MIN_RIG_MATCHES, POSE_HINT, misfit_error
 from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
 
+MIN_RIG_MATCHES = 30
+"""Over all frames; a pair of cameras with fewer tells nothing about the rig."""
 MAX_MATCHES = 20_000
 PRIOR_DEG = 2.0
 NOISE = 1e-3
 """Radians, less than a pixel: where the robust loss sets in."""
-MAX_TURN_DEG = 5.0
-"""A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
 NOTABLE_TURN_DEG = 1.5
 """A relative port tilt of 6 degrees: worth a word."""
-MAX_REST = 5e-3
-"""Radians that no turn explains, median: a wrong direction of the baseline."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +53,9 @@ class RigRotation:
 
 
 def correct_rotations(
-    rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: Array,
+    pairs: Sequence[PairMatches],
 ) -> RigRotation:
     """Estimate small turns of the cameras from matches of the same frame.
 
@@ -64,15 +63,11 @@ def correct_rotations(
     the perspective; a weak prior holds them where the images do not tell.
 
     Args:
-        rig: Cameras and initial ports.
+        cameras: With initial ports.
         cam_from_rig: Poses (C, 7) to start from.
-        pairs: Matches of the same frame.
-
-    Raises:
-        InputError: the rig needs more than a port could explain.
+        pairs: Matches of the same frame, at least `MIN_RIG_MATCHES` in one of them.
     """
     used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
-    cameras = rig.refractive_cameras()
     num_cameras = len(cameras)
 
     def turned(delta: Array) -> Array:
@@ -102,47 +97,35 @@ def correct_rotations(
     poses = turned(solution.x)
     turn_deg = np.zeros(num_cameras)
     turn_deg[1:] = np.degrees(np.linalg.norm(solution.x.reshape(-1, 3), axis=1))
-    before = float(np.median(np.abs(angles(np.asarray(cam_from_rig)))))
-    after = float(np.median(np.abs(angles(poses))))
-    worst = int(turn_deg.argmax())
-    if turn_deg[worst] > MAX_TURN_DEG:
-        raise InputError(
-            f"cam_from_rig of camera {rig.cameras[worst].name!r} does not fit the "
-            f"images: it would have to turn by {turn_deg[worst]:.0f} degrees or more, "
-            f"which no tilted port explains; {POSE_HINT}"
-        )
-    if after > MAX_REST:
-        name_a, name_b = (
-            rig.cameras[index].name for index in (used[0].camera_a, used[0].camera_b)
-        )
-        raise misfit_error(name_a, name_b, after)
     return RigRotation(
         cam_from_rig=poses,
         turn_deg=turn_deg,
-        misfit_before=before,
-        misfit_after=after,
+        misfit_before=float(np.median(np.abs(angles(np.asarray(cam_from_rig))))),
+        misfit_after=float(np.median(np.abs(angles(poses)))),
     )
 
 
 def _thinned(pair: PairMatches) -> PairMatches:
     """At most `MAX_MATCHES` of the matches, evenly taken."""
     step = -(-len(pair) // MAX_MATCHES)
-    return PairMatches(
-        camera_a=pair.camera_a,
-        camera_b=pair.camera_b,
+    return replace(
+        pair,
         frame_idx=pair.frame_idx[::step],
         xy_a=pair.xy_a[::step],
         xy_b=pair.xy_b[::step],
     )
 
 
-def scene_depths(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> Array:
+def scene_depths(
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: Array,
+    pairs: Sequence[PairMatches],
+) -> Array:
     """How far away the scene is: 10th, 50th and 90th percentile of depth (C, 3).
 
     Depth is the third coordinate in the camera's own frame, metres. A camera that
     shares no view takes the percentiles of all points of the others.
     """
-    cameras = rig.refractive_cameras()
     seen: list[list[Array]] = [[] for _ in cameras]
     for pair in pairs:
         if len(pair) < MIN_RIG_MATCHES:

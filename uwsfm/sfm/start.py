@@ -7,20 +7,20 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-import uwsfm
 from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
-from uwsfm.sfm.features import extract_features, store_intrinsics
+from uwsfm.sfm.features import ENHANCED, extract_features, store_intrinsics
 from uwsfm.sfm.images import Frames, check_images, find_frames
 from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping_database import write_mapping_database
@@ -28,7 +28,7 @@ from uwsfm.sfm.matching import clear_matches, match_features
 from uwsfm.sfm.options import FeatureOptions, StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
 from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
-from uwsfm.sfm.rig_check import check_rig
+from uwsfm.sfm.rig_check import check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import read_same_frame_matches
 from uwsfm.sfm.steps import Steps
@@ -47,7 +47,7 @@ class Workspace:
 
     @property
     def enhanced(self) -> Path:
-        return self.work_dir / "clahe"
+        return self.work_dir / ENHANCED
 
     @property
     def rig(self) -> Path:
@@ -103,6 +103,32 @@ def perspective_start(
     frames = find_frames(Path(image_dir), rig)
     steps, space = Steps(Path(work_dir)), Workspace(work_dir=Path(work_dir))
     key = _match_images(rig, frames, steps, space, options, progress)
+    return start_from_matches(rig, frames, steps, key, options, progress)
+
+
+def start_from_matches(
+    rig: Rig,
+    frames: Frames,
+    steps: Steps,
+    key: str,
+    options: StartOptions,
+    progress: Progress = silent,
+) -> PerspectiveStart:
+    """`perspective_start`, from a workspace whose database holds raw matches.
+
+    Args:
+        rig: As in `perspective_start`.
+        frames: The images; only their names are used.
+        steps: Of the workspace.
+        key: Fingerprint of what the matches depend on.
+        options: How.
+        progress: Called with each long step.
+
+    Raises:
+        InputError: the rig contradicts the matches.
+        UwsfmError: nothing could be reconstructed.
+    """
+    space = Workspace(work_dir=steps.work_dir)
     geometry = [_rig_content(rig), asdict(options.verification), options.seed]
     if rig.cam_from_rig is None:
         key = steps.run(
@@ -138,6 +164,10 @@ def perspective_start(
         lambda: _map(rig, frames, fixed(), space, options, progress),
         outputs=[space.perspective],
     )
+    return _loaded(space, frames, steps)
+
+
+def _loaded(space: Workspace, frames: Frames, steps: Steps) -> PerspectiveStart:
     start = load_start(space.perspective, space.features, frames)
     start.summary["timings_s"] = steps.seconds()
     return start
@@ -152,9 +182,9 @@ def _match_images(
     progress: Progress,
 ) -> str:
     """Features and raw matches; neither depends on lenses, ports or poses."""
-    sizes = [(c.camera.width, c.camera.height) for c in rig.cameras]
+    sizes = sorted([c.images, c.camera.width, c.camera.height] for c in rig.cameras)
     inputs = [
-        [uwsfm.__version__, pycolmap.__version__],
+        [version("uwsfm"), pycolmap.__version__],
         sizes,
         frames.fingerprint(),
         asdict(options.features),
@@ -236,11 +266,12 @@ def _fix_rig(rig: Rig, poses: Array, frames: Frames, space: Workspace) -> _Fixed
     """Check the rig against its images, turn it to fit them, and fit the pinholes."""
     pairs = read_same_frame_matches(space.features, frames, rig)
     check_rig(rig, poses, pairs)
-    rotation = correct_rotations(rig, poses, pairs)
-    depths = scene_depths(rig, rotation.cam_from_rig, pairs)
+    cameras = rig.refractive_cameras()
+    rotation = correct_rotations(cameras, poses, pairs)
+    check_rotation(rig, rotation, pairs)
+    depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
     pinholes = tuple(
-        fit_virtual_pinhole(camera, depths[c])
-        for c, camera in enumerate(rig.refractive_cameras())
+        fit_virtual_pinhole(camera, depths[c]) for c, camera in enumerate(cameras)
     )
     return _FixedRig(
         rotation=rotation,

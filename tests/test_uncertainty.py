@@ -1,0 +1,54 @@
+"""Standard deviations that hold when the errors of neighbouring features are shared."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwsfm import calibrate
+from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
+from uwsfm.simulate.rigs import sample_rig
+from uwsfm.simulate.trajectories import rich_motion
+
+RUNS = 24
+
+
+def dive(noise_px=0.0):
+    """Twelve frames: 96 quarters of images, which is enough to learn from."""
+    options = ObservationOptions(num_points=300, noise_px=noise_px)
+    return simulate_scene(sample_rig(), rich_motion(12), Relief(stddev=0.2), options)
+
+
+def test_shared_errors_are_seen(rng):
+    """Errors of 0.1 px alone, and 0.1 px shared by each quarter of each image.
+
+    Taken for independent noise, they would promise far too much.
+    """
+    truth = dive().truth
+    half = np.array([[c.width, c.height] for c in truth.cameras])[truth.camera_idx] / 2
+    tile = (truth.xy > half).astype(np.int64)
+    errors, alone, reported = [], [], []
+    for _ in range(RUNS):
+        shared = rng.normal(0.0, 0.1, (2, truth.num_frames, 2, 2, 2))
+        noise = rng.normal(0.0, 0.1, truth.xy.shape)
+        noise += shared[truth.camera_idx, truth.frame_idx, tile[:, 0], tile[:, 1]]
+        result = calibrate(replace(truth, xy=truth.xy + noise), loss="l2")
+        for camera in (0, 1):
+            col = result.covariance.border_cols[camera, 8]
+            found = result.scene.ports[camera].distance
+            errors.append(found - truth.ports[camera].distance)
+            alone.append(np.sqrt(result.covariance.border[col, col]))
+            reported.append(result.covariance.cameras[camera].distance_stddev_m)
+    spread = np.sqrt(np.mean(np.square(errors)))
+    # 48 errors, correlated in pairs: their RMS is known to about 15 %.
+    assert spread > 1.5 * np.mean(alone)
+    assert 0.6 < spread / np.mean(reported) < 1.5
+
+
+def test_independent_errors_are_not_inflated():
+    """The larger of two estimates of one number is larger by their own scatter only."""
+    result = calibrate(dive(noise_px=0.2).scene, loss="l2")
+    for camera in (0, 1):
+        col = result.covariance.border_cols[camera, 8]
+        alone = np.sqrt(result.covariance.border[col, col])
+        reported = result.covariance.cameras[camera].distance_stddev_m
+        assert alone <= reported < 1.4 * alone

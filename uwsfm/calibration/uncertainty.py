@@ -1,0 +1,127 @@
+"""What is known of the estimates at an optimum: covariances and standard deviations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm.calibration.problem import CameraCovariance, Covariance
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import IndexArray
+from uwsfm.solver import schur
+from uwsfm.solver.clustered import clustered_covariance
+from uwsfm.solver.covariance import point_covariances, reduced_covariance
+from uwsfm.solver.layout import Layout
+from uwsfm.solver.levenberg_marquardt import (
+    LengthPriors,
+    LevenbergMarquardtOptions,
+    Problem,
+)
+from uwsfm.solver.state import State, translation_arm
+
+# Neighbours err together within a quarter of an image. Fewer, larger clusters would
+# number less than the poses they have to tell apart.
+TILES = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Optimum:
+    """A least-squares optimum over part of a scene."""
+
+    layout: Layout
+    state: State
+    """Points numbered as in the layout."""
+    used: IndexArray
+    """(P',) index of each of these points in the scene."""
+    num_points: int
+    """Of the scene."""
+    columns: IndexArray
+    """(C, BORDER_SIZE)"""
+    at_zero: NDArray[np.bool_]
+    """(C,) distances held at their bound."""
+    priors: LengthPriors
+    sigma_px: float
+    image_sizes: IndexArray
+    """(C, 2) width, height."""
+    degrees_of_freedom: int
+
+
+def posterior_covariance(optimum: Optimum) -> Covariance:
+    """Covariances from the noise found, and standard deviations that neighbours' shared
+    errors cannot beat."""
+    layout = optimum.layout
+    options = LevenbergMarquardtOptions(loss="l2")
+    eqs = Problem(layout, options, optimum.priors).linearize(optimum.state)
+    reduced = reduced_covariance(layout, eqs)
+    variance = optimum.sigma_px**2
+    border = variance * reduced.border(layout)
+    points = np.full((optimum.num_points, 3, 3), np.nan)
+    points[optimum.used] = variance * point_covariances(layout, eqs, reduced)
+    shared = np.full_like(border, np.nan)
+    if reduced.determined:
+        shared = _shared_errors(optimum, eqs, reduced.matrix)
+    cameras = []
+    for camera, pose in enumerate(optimum.state.cam_from_rig):
+        cols, at_zero = optimum.columns[camera], bool(optimum.at_zero[camera])
+        alone, together = (camera_variances(b, cols, pose) for b in (border, shared))
+        # Sampling noise can make the second one smaller: then the first is the truth.
+        cameras.append(_camera_covariance(np.maximum(alone, together), at_zero))
+    return Covariance(
+        border=border,
+        border_cols=optimum.columns,
+        frames=variance * reduced.frames(layout),
+        points=points,
+        cameras=tuple(cameras),
+        determined=reduced.determined,
+    )
+
+
+def _shared_errors(optimum: Optimum, eqs, reduced: Array) -> Array:
+    """Cluster-robust covariance (B, B) of the border, priors included."""
+    layout = optimum.layout
+    offset = layout.num_frame_cols
+    _, _, inverses = schur.reduced_system(layout, eqs, 0.0)
+    covariance = clustered_covariance(
+        layout, optimum.state.kernel_state(), eqs, inverses, reduced, _clusters(optimum)
+    )
+    # Residuals are smaller than errors by the share of fitted parameters.
+    covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
+    priors = reduced[:, offset + optimum.priors.cols]
+    covariance += optimum.sigma_px**2 * (priors * optimum.priors.weights) @ priors.T
+    return covariance[offset:, offset:]
+
+
+def _clusters(optimum: Optimum) -> IndexArray:
+    """Cluster (N,) of each sorted observation: its image, and the tile in it."""
+    layout = optimum.layout
+    frame = np.repeat(layout.cell_frame, np.diff(layout.cell_start))
+    place = TILES * layout.xy / optimum.image_sizes[layout.camera]
+    column, row = np.clip(place.astype(np.int64), 0, TILES - 1).T
+    keys = np.stack([layout.camera, frame, row, column], axis=1)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def camera_variances(border: Array, cols: IndexArray, cam_from_rig: Array) -> Array:
+    """Variances (6,) of one camera from the border's covariance.
+
+    Of the angle of the normal and the port distance, of the rotation angle of
+    cam_from_rig, and of its translation's x, y, z; radians and metres, squared.
+    """
+    padded = np.zeros((len(border) + 1, len(border) + 1))
+    padded[:-1, :-1] = border  # HELD = -1 reads the zeros at the end
+    block = padded[np.ix_(cols, cols)]
+    arm = translation_arm(cam_from_rig[4:]).reshape(3, 3)
+    translation = np.einsum("ka,kl,la->a", arm, block[3:6, 3:6], arm)
+    rotation, normal = np.trace(block[:3, :3]), np.trace(block[6:8, 6:8])
+    return np.array([normal, block[8, 8], rotation, *translation])
+
+
+def _camera_covariance(variances: Array, at_zero: bool) -> CameraCovariance:
+    normal, distance, rotation, x, y, z = np.sqrt(variances).tolist()
+    return CameraCovariance(
+        normal_stddev_deg=float(np.degrees(normal)),
+        distance_stddev_m=distance,
+        rotation_stddev_deg=float(np.degrees(rotation)),
+        translation_stddev_m=(x, y, z),
+        distance_at_zero=at_zero,
+    )

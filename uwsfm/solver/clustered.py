@@ -1,0 +1,123 @@
+"""Covariance that holds when neighbouring features err together.
+
+The inverse of the normal equations promises that every observation errs alone. On real
+images they do not: what the lens model leaves over, and how a feature detector sees a
+slanted surface, is shared by neighbours. The cluster-robust ("sandwich") covariance of
+Liang & Zeger (Biometrika 1986) lets observations of one cluster err in any common way:
+
+    S^-1 (sum over clusters of s s^T) S^-1,   s = sum of J~^T r over a cluster
+
+with S the reduced system and J~ the Jacobian after elimination of the points.
+"""
+
+import numpy as np
+
+from uwsfm._jit import kernel
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.status import VALID
+from uwsfm.residuals.reprojection import (
+    BORDER_SIZE,
+    point_in_rig,
+    residual_with_jac,
+)
+from uwsfm.scene import IndexArray
+from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.normal_equations import KernelState, NormalEquations
+
+
+@kernel
+def _add_score(layout, eqs, p, col, torque_force, pull, border, cols, offset, score):
+    """Add J~^T r of one observation: its own part, minus what its point takes up."""
+    if col != HELD:
+        for a in range(6):
+            score[col + a] += torque_force[a]
+    for k in range(BORDER_SIZE):
+        if cols[k] != HELD:
+            score[offset + cols[k]] += border[k]
+    for c in range(layout.point_start[p], layout.point_start[p + 1]):
+        other = layout.frame_col[layout.cell_frame[c]]
+        if other == HELD:
+            continue
+        w = eqs.cells[c]
+        for a in range(6):
+            score[other + a] -= (
+                w[a, 0] * pull[0] + w[a, 1] * pull[1] + w[a, 2] * pull[2]
+            )
+    e = eqs.points_border[p]
+    for k in range(len(eqs.border_grad)):
+        score[offset + k] -= e[0, k] * pull[0] + e[1, k] * pull[1] + e[2, k] * pull[2]
+
+
+@kernel
+def _scores(layout, state, eqs, inverses, cluster, offset, out):
+    """Sum J~^T r of each cluster into out (clusters, n); squared loss."""
+    j_port, j_rig = np.empty((2, 9)), np.empty((2, 3))
+    j_border = np.empty((2, BORDER_SIZE))
+    force, grad = np.empty(6), np.empty(BORDER_SIZE)
+    for p in range(len(layout.point_start) - 1):
+        inverse = inverses[p]
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            f = layout.cell_frame[c]
+            frame = state.frames[f]
+            x, y, z = point_in_rig(frame, state.points[p])
+            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
+                k = layout.camera[i]
+                status, rx, ry = residual_with_jac(
+                    x,
+                    y,
+                    z,
+                    layout.xy[i],
+                    state.cams[k],
+                    state.arms[k],
+                    state.lenses[k],
+                    state.ports[k],
+                    j_port,
+                    j_rig,
+                    j_border,
+                )
+                if status != VALID:
+                    continue
+                g = j_rig[0] * rx + j_rig[1] * ry
+                force[0], force[1] = y * g[2] - z * g[1], z * g[0] - x * g[2]
+                force[2], force[3:] = x * g[1] - y * g[0], g
+                grad[:] = j_border[0] * rx + j_border[1] * ry
+                in_world = np.empty(3)
+                for a in range(3):
+                    in_world[a] = (
+                        frame[a] * g[0] + frame[4 + a] * g[1] + frame[8 + a] * g[2]
+                    )
+                pull = inverse @ in_world
+                _add_score(
+                    layout,
+                    eqs,
+                    p,
+                    layout.frame_col[f],
+                    force,
+                    pull,
+                    grad,
+                    layout.border_col[k],
+                    offset,
+                    out[cluster[i]],
+                )
+
+
+def clustered_covariance(
+    layout: Layout,
+    state: KernelState,
+    eqs: NormalEquations,
+    inverses: Array,
+    reduced: Array,
+    cluster: IndexArray,
+) -> Array:
+    """Covariance (n, n) of frames and border, for errors shared within clusters.
+
+    Args:
+        layout, state, eqs: the problem at its least-squares optimum.
+        inverses: (P, 3, 3) inverses of the point blocks.
+        reduced: (n, n) inverse of the reduced system, unit noise.
+        cluster: (N,) cluster of each sorted observation, counted from 0.
+    """
+    scores = np.zeros((int(cluster.max()) + 1, len(reduced)))
+    _scores(layout, state, eqs, inverses, cluster, layout.num_frame_cols, scores)
+    half = reduced @ scores.T
+    return half @ half.T
