@@ -15,14 +15,14 @@ import numpy as np
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.status import VALID
-from uwsfm.residuals.reprojection import (
-    BORDER_SIZE,
-    point_in_rig,
-    residual_with_jac,
-)
+from uwsfm.residuals.reprojection import BORDER_SIZE, point_in_rig
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD, Layout
-from uwsfm.solver.normal_equations import KernelState, NormalEquations
+from uwsfm.solver.normal_equations import (
+    KernelState,
+    NormalEquations,
+    linearized_residual,
+)
 
 
 @kernel
@@ -61,19 +61,8 @@ def _scores(layout, state, eqs, inverses, cluster, offset, out):
             frame = state.frames[f]
             x, y, z = point_in_rig(frame, state.points[p])
             for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-                k = layout.camera[i]
-                status, rx, ry = residual_with_jac(
-                    x,
-                    y,
-                    z,
-                    layout.xy[i],
-                    state.cams[k],
-                    state.arms[k],
-                    state.lenses[k],
-                    state.ports[k],
-                    j_port,
-                    j_rig,
-                    j_border,
+                status, rx, ry = linearized_residual(
+                    layout, state, i, x, y, z, j_port, j_rig, j_border
                 )
                 if status != VALID:
                     continue
@@ -95,7 +84,7 @@ def _scores(layout, state, eqs, inverses, cluster, offset, out):
                     force,
                     pull,
                     grad,
-                    layout.border_col[k],
+                    layout.border_col[layout.camera[i]],
                     offset,
                     out[cluster[i]],
                 )

@@ -127,6 +127,25 @@ def total_cost(layout, state, loss, scale, squares):
 
 
 @kernel
+def linearized_residual(layout, state, i, x, y, z, j_port, j_rig, j_border):
+    """`residual_with_jac` of sorted observation i, at a point (x, y, z) in the rig."""
+    camera = layout.camera[i]
+    return residual_with_jac(
+        x,
+        y,
+        z,
+        layout.xy[i],
+        state.cams[camera],
+        state.arms[camera],
+        state.lenses[camera],
+        state.ports[camera],
+        j_port,
+        j_rig,
+        j_border,
+    )
+
+
+@kernel
 def _add_observation(j_rig, j_border, cols, rx, ry, weight, hess, grad, couple, out):
     """Add one weighted observation to its cell's sums and to the border blocks."""
     for a in range(3):
@@ -219,18 +238,8 @@ def linearize(layout, state, loss, scale, out):
             hess[:], grad[:], couple[:] = 0.0, 0.0, 0.0
             for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
                 k = layout.camera[i]
-                status, rx, ry = residual_with_jac(
-                    x,
-                    y,
-                    z,
-                    layout.xy[i],
-                    state.cams[k],
-                    state.arms[k],
-                    state.lenses[k],
-                    state.ports[k],
-                    j_port,
-                    j_rig,
-                    j_border,
+                status, rx, ry = linearized_residual(
+                    layout, state, i, x, y, z, j_port, j_rig, j_border
                 )
                 if status == VALID:
                     _, weight = rho(rx * rx + ry * ry, loss, scale)
