@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models import projection
+from uwsfm.models.caustic import caustic_points
 from uwsfm.models.lens import SUPPORTED_MODELS, lens_row
 from uwsfm.models.port import FlatPort
 from uwsfm.models.status import VALID
@@ -110,6 +111,19 @@ class RefractiveCamera:
     def status_from_img(self, xy: ArrayLike) -> StatusArray:
         """Reason codes (N,) of `ray_from_img`, see `uwsfm.Status`."""
         return self._unproject(xy)[1]
+
+    def caustic(self, xy: ArrayLike) -> tuple[Array, Array]:
+        """Where the water ray of a pixel meets those of its neighbours (paper fig. 3).
+
+        Args:
+            xy: (N, 2) pixels.
+
+        Returns:
+            The sagittal focal points, all on the axis through the camera along the
+            port's normal, and the tangential ones; (N, 3) each, in the camera frame,
+            NaN where the pixel has no ray.
+        """
+        return caustic_points(*self.ray_from_img(xy), self._port)
 
     def img_from_point(self, points_in_cam: ArrayLike) -> tuple[Array, Mask]:
         """Exact projection of points in the water.
