@@ -101,14 +101,14 @@ def comparison_table(comparison: Comparison) -> Table:
         table.add_column(column, justify="right", no_wrap=True)
     for camera in comparison.cameras:
         table.add_row(
-            f"{camera.name}: port tilt (deg)",
+            f"{camera.name}: tilt (deg)",
             _tilt(camera.normal),
             _number(camera.tilt_stddev_deg, "{:.3f}"),
             _tilt(camera.true_normal),
             f"{camera.tilt_error_deg:.3f}",
         )
         table.add_row(
-            f"{camera.name}: port distance (mm)",
+            f"{camera.name}: distance (mm)",
             f"{1e3 * camera.distance_m:.2f}",
             _number(camera.distance_stddev_m, "{:.2f}", 1e3),
             f"{1e3 * camera.true_distance_m:.2f}",
@@ -117,8 +117,8 @@ def comparison_table(comparison: Comparison) -> Table:
     registered, given = str(comparison.num_frames), str(comparison.num_true_frames)
     table.add_row("frames", registered, "", given, "")
     refractive, pinhole = comparison.center_rms_m, comparison.pinhole_center_rms_m
-    table.add_row("rig centres, RMS (mm)", "", "", "", f"{1e3 * refractive:.2f}")
-    table.add_row("  of the pinhole start (mm)", "", "", "", f"{1e3 * pinhole:.2f}")
+    table.add_row("rig centres (mm RMS)", "", "", "", f"{1e3 * refractive:.2f}")
+    table.add_row("  of pinhole start", "", "", "", f"{1e3 * pinhole:.2f}")
     return table
 
 
