@@ -7,6 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
+
+from uwsfm.console import console, housing_table
+from uwsfm.pipeline import WORK
 
 COMMANDS = [
     [],
@@ -101,6 +105,43 @@ def test_reconstruct_never_overwrites_a_foreign_model(tmp_path):
         "was not made by uwsfm",
     )
     assert keep.read_bytes() == b"mine"
+
+
+def test_reconstruct_never_clears_a_foreign_folder(tmp_path):
+    """A folder of the name of the workspace may hold anything."""
+    mine = tmp_path / "out" / WORK / ".git" / "config"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    run("init", "rig.yaml", cwd=tmp_path)
+    _one_sentence(
+        run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path),
+        "was not made by uwsfm",
+    )
+    assert mine.read_text() == "mine"
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    run("init", "rig.yaml", cwd=tmp_path)
+    (tmp_path / "out" / WORK).mkdir(parents=True)
+    with FileLock(tmp_path / "out" / WORK / "lock"):
+        _one_sentence(
+            run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path),
+            "another uwsfm is at work",
+        )
+
+
+def test_names_are_printed_as_they_are(capsys):
+    """Square brackets are markup to the library that draws the tables."""
+    camera = {
+        "name": "[/x]",
+        "normal": [0.0, 0.0, 1.0],
+        "normal_stddev_deg": None,
+        "distance_m": 0.02,
+        "distance_stddev_m": None,
+        "distance_verdict": "held",
+    }
+    console.print(housing_table({"cameras": [camera]}))
+    assert "[/x]" in capsys.readouterr().out
 
 
 def test_unsupported_lens_is_named(tmp_path):

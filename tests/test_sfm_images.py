@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwsfm.errors import InputError
-from uwsfm.sfm.images import check_images, find_frames, natural_key
+from uwsfm.sfm.images import check_images, check_masks, find_frames, natural_key
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
 from uwsfm.simulate.rigs import sample_rig
 
@@ -133,3 +133,20 @@ def test_options_refuse_what_they_cannot_do(tmp_path):
         FeatureOptions(mask_dir=tmp_path / "nowhere")
     with pytest.raises(InputError, match="'random'"):
         MatchOptions(strategy="random")  # type: ignore[arg-type]
+
+
+def test_masks_are_named_when_they_do_not_fit(image_dir, rig, tmp_path):
+    frames, masks = find_frames(image_dir, rig), tmp_path / "masks"
+    with pytest.raises(InputError, match="of image left/frame1.png does not exist"):
+        check_masks(frames, rig, masks)
+    white = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
+    for name in frames.image_names():
+        (masks / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(masks / f"{name}.png"), white)
+    check_masks(frames, rig, masks)
+    cv2.imwrite(str(masks / "right" / "frame2.png.png"), white[:30])
+    with pytest.raises(InputError, match="frame2.png.png has 80 x 30 pixels"):
+        check_masks(frames, rig, masks)
+    (masks / "right" / "frame2.png.png").write_text("no image")
+    with pytest.raises(InputError, match="frame2.png.png cannot be read"):
+        check_masks(frames, rig, masks)

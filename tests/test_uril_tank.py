@@ -32,7 +32,7 @@ def study(tmp_path_factory):
         out = tmp_path_factory.mktemp("tank")
         how = {"whole_image": False, "free_rig": False}
         result, checks = pipeline.run_refractive(DATA, out, **how)
-        work, rig = out / "run" / "work", result.model.rig
+        work, rig = out / "run" / pipeline.WORK, result.model.rig
         pinhole = self_calibrated.run(DATA, work, out / "pinhole", rig)
         yield result, checks, pinhole
     finally:

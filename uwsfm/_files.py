@@ -7,15 +7,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from uwsfm.errors import InputError
+
+PARTIAL = ".uwsfm-partial-"
+"""Start of the names of what is being written; a killed process leaves it behind."""
+
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; rename it to ``path`` on success."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(
-        dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix
-    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=PARTIAL, suffix=path.suffix
+        )
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
     os.close(handle)
     os.chmod(name, 0o644)
     partial = Path(name)
@@ -30,8 +38,11 @@ def replaced_file(path: Path) -> Iterator[Path]:
 def replaced_dir(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``; it takes its place on success."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=PARTIAL))
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
     os.chmod(partial, 0o755)
     try:
         yield partial

@@ -10,6 +10,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,10 +32,11 @@ def _source_key() -> str:
 def _cache_dir() -> Path | None:
     home = os.environ.get("UWSFM_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     user = os.getuid() if hasattr(os, "getuid") else "user"
-    candidates = [
-        Path(home) if home else Path.home() / ".cache",
-        Path(tempfile.gettempdir()) / f"uwsfm-{user}",
-    ]
+    candidates = [Path(home)] if home else []
+    if not home:
+        with suppress(RuntimeError):  # a user without a home, as in containers
+            candidates.append(Path.home() / ".cache")
+    candidates.append(Path(tempfile.gettempdir()) / f"uwsfm-{user}")
     for base in candidates:
         folder = base / "uwsfm" / "kernels" / _source_key()
         try:

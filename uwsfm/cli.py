@@ -3,6 +3,7 @@
 Heavy packages are imported inside the commands, so that `uwsfm --help` is instant.
 """
 
+import io
 import logging
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ simulate_app = typer.Typer(
 )
 app.add_typer(simulate_app, name="simulate")
 
-FAILED, WRONG_INPUT, INTERRUPTED = 1, 2, 130
+FAILED, WRONG_INPUT = 1, 2
 
 
 @app.callback()
@@ -79,8 +80,8 @@ def reconstruct(
         Literal["auto", "exhaustive", "sequential"],
         typer.Option(help="Which frames are compared; auto: by their number."),
     ] = "auto",
-    seed: Annotated[int, typer.Option(help="Of all random choices.")] = 0,
-    threads: Annotated[int, typer.Option(help="-1: all cores.")] = -1,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
+    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
     """Reconstruct a dive: images and a rig file in, a metric model out.
 
@@ -196,27 +197,32 @@ def simulate_observations(
 
 
 def _print_result(summary: dict) -> None:
+    from rich.markup import escape
+
     from uwsfm.console import console, housing_table, result_table, timings_table
 
     console.print(result_table(summary))
     console.print(housing_table(summary))
     for warning in summary["warnings"]:
-        console.print(f"[yellow]note:[/yellow] {warning}")
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
     console.print(timings_table(summary["timings_s"]))
 
 
 def main() -> None:
     """Run the command line; every error ends in one sentence and a non-zero code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without "±" shows "?"
+            stream.reconfigure(errors="replace")
     try:
         app()
     except InputError as error:
         _fail(str(error), WRONG_INPUT)
     except UwsfmError as error:
         _fail(str(error), FAILED)
-    except (OSError, MemoryError) as error:
-        _fail(f"{type(error).__name__}: {error}", FAILED)
-    except KeyboardInterrupt:
-        _fail("interrupted; the same command resumes the run", INTERRUPTED)
+    except OSError as error:
+        _fail(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), FAILED)
+    except MemoryError:
+        _fail("out of memory", FAILED)
 
 
 def _fail(message: str, code: int) -> None:

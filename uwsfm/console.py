@@ -16,6 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from uwsfm.evaluate import Comparison
@@ -39,15 +40,18 @@ class ProgressBars:
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> ProgressBars:
-        self._progress.start()
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
         if failure is None:
             self._finish_others("")
         self._progress.stop()
+        if failure is not None and issubclass(failure, KeyboardInterrupt):
+            errors.print("interrupted; the same command resumes the run")
 
     def __call__(self, step: str, done: int, total: int | None) -> None:
+        if not self._tasks:
+            self._progress.start()  # not before: an early error stands alone
         if step not in self._tasks:
             self._finish_others(step)
             self._tasks[step] = self._progress.add_task(step, total=total)
@@ -69,7 +73,7 @@ def housing_table(summary: dict[str, Any]) -> Table:
         table.add_column(column, justify="right", no_wrap=True)
     for camera in summary["cameras"]:
         table.add_row(
-            camera["name"],
+            Text(camera["name"]),
             _tilt(camera["normal"]),
             _number(camera["normal_stddev_deg"], "{:.3f}"),
             f"{1e3 * camera['distance_m']:.2f}",
@@ -101,14 +105,14 @@ def comparison_table(comparison: Comparison) -> Table:
         table.add_column(column, justify="right", no_wrap=True)
     for camera in comparison.cameras:
         table.add_row(
-            f"{camera.name}: tilt (deg)",
+            Text(f"{camera.name}: tilt (deg)"),
             _tilt(camera.normal),
             _number(camera.tilt_stddev_deg, "{:.3f}"),
             _tilt(camera.true_normal),
             f"{camera.tilt_error_deg:.3f}",
         )
         table.add_row(
-            f"{camera.name}: distance (mm)",
+            Text(f"{camera.name}: distance (mm)"),
             f"{1e3 * camera.distance_m:.2f}",
             _number(camera.distance_stddev_m, "{:.2f}", 1e3),
             f"{1e3 * camera.true_distance_m:.2f}",

@@ -1,9 +1,14 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
+import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.problem import CalibrationResult
@@ -23,12 +28,16 @@ from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colors import point_colors
+from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.options import FeatureOptions, Matching, MatchOptions, StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
 from uwsfm.sfm.refine import Refined, refine_scene
 from uwsfm.sfm.start import perspective_start
+from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
-WORK = "work"
+WORK = "uwsfm-work"
+"""Folder inside the output folder where the steps keep their results."""
+LOCK = "lock"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,14 +103,22 @@ def reconstruct(
         seed=seed,
         num_threads=num_threads,
     )
-    start = perspective_start(rig, Path(images), out / WORK, options, progress)
+    find_frames(Path(images), rig)  # wrong folders fail before anything is written
+    with _locked(out):
+        return _reconstruct(rig, Path(images), out, options, progress)
+
+
+def _reconstruct(
+    rig: Rig, images: Path, out: Path, options: StartOptions, progress: Progress
+) -> ReconstructResult:
+    start = perspective_start(rig, images, out / WORK, options, progress)
     timings = dict(start.summary["timings_s"])
     clock = time.perf_counter()
     arrays = read_start(start)
     refined = refine_scene(_start_scene(rig, start, arrays), rig, progress)
     timings["refractive adjustment"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    model = _model(rig, Path(images), arrays, refined, progress)
+    model = _model(rig, images, arrays, refined, progress)
     export_colmap(model, out / SPARSE)
     export_housing(model, out / HOUSING, refined.calibration)
     export_ply(model, out / POINTS, refined.calibration.covariance.points)
@@ -117,15 +134,46 @@ def reconstruct(
 
 
 def _output_folder(out: str | Path) -> Path:
-    """Refuse what would overwrite somebody else's model."""
+    """Refuse what would overwrite files that are not ours."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, not a folder for results")
-    if (out / SPARSE).exists() and not (out / WORK).exists():
-        raise InputError(
-            f"{out / SPARSE} exists and was not made by uwsfm: choose another folder"
-        )
+    if _made_by_us(out):
+        return out
+    for name in (SPARSE, HOUSING, POINTS, SUMMARY, WORK):
+        if (out / name).exists():
+            raise InputError(
+                f"{out / name} exists and was not made by uwsfm: choose another folder"
+            )
     return out
+
+
+def _made_by_us(out: Path) -> bool:
+    """Whether an earlier run, finished or not, left its marks in a folder."""
+    if (out / WORK / STEPS_FILE).exists() or (out / WORK / LOCK).exists():
+        return True
+    try:
+        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+        return "uwsfm" in summary["versions"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Keep a second run out of the folder: both would write the same database."""
+    try:
+        (out / WORK).mkdir(parents=True, exist_ok=True)
+        lock = FileLock(out / WORK / LOCK)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(f"another uwsfm is at work in {out}") from None
+    except OSError as error:
+        raise InputError(f"cannot write to {out}: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:

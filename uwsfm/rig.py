@@ -179,10 +179,12 @@ def camera_from_colmap(
     """
     import pycolmap
 
+    from uwsfm.models.lens import SUPPORTED_MODELS
+
     if model not in lens_models():
         raise InputError(
             f"model {model!r} is not one of COLMAP's for a port; choose from "
-            f"{', '.join(lens_models())}"
+            f"{', '.join(SUPPORTED_MODELS)}"
         )
     camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     names = camera.params_info.split(", ")
@@ -269,7 +271,7 @@ def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float
     if value < 0:
         raise InputError(f"{value:g} m is negative; a {noun} cannot be")
     if value > limit:
-        guess = np.format_float_positional(value / 1000, min_digits=3)
+        guess = np.format_float_positional(float(f"{value / 1000:.6g}"), min_digits=3)
         raise InputError(
             f"{value:g} m is not a {noun}; {plural} are in metres, "
             f"did you mean {guess}?"

@@ -64,6 +64,11 @@ class Scene:
         cameras = tuple(cameras)
         if not cameras:
             raise InputError("cameras is empty: a scene needs at least one camera")
+        for index, camera in enumerate(cameras):
+            if not isinstance(camera, RefractiveCamera):
+                raise InputError(
+                    f"cameras[{index}] must be a RefractiveCamera, got {camera!r}"
+                )
         cam_poses = _poses("cam_from_rig", cam_from_rig)
         frame_poses = _poses("rig_from_world", rig_from_world)
         if len(cam_poses) != len(cameras):
@@ -90,6 +95,12 @@ class Scene:
             frame_idx=_indices("frame_idx", frame_idx, count, len(frame_poses)),
             point_idx=_indices("point_idx", point_idx, count, len(point_rows)),
             xy=pixels,
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({len(self.cameras)} cameras, {self.num_frames} frames, "
+            f"{self.num_points} points, {self.num_observations} observations)"
         )
 
     @property

@@ -18,6 +18,7 @@ from budget import error_budget, recalibration
 
 import uwsfm
 from uwsfm.console import ProgressBars
+from uwsfm.pipeline import WORK
 
 COVERED_PERCENTILE = 99.5
 """The in-air boards did not reach the image corners: the lens is trusted up to the
@@ -137,7 +138,7 @@ def main() -> None:
         uwsfm.load_rig(out / "rig.yaml").cam_from_rig[1],
     )
     boards.insert(0, board_line("pinhole, as calibrated in air", in_air, None))
-    pinhole = self_calibrated.run(data, out / "run" / "work", out / "pinhole", rig)
+    pinhole = self_calibrated.run(data, out / "run" / WORK, out / "pinhole", rig)
     checks = check_boards(
         data / "tank_corners.npz",
         *(pinhole_rays(camera) for camera in pinhole.cameras),
@@ -148,7 +149,7 @@ def main() -> None:
     print(
         f"\nregistered: {summary['num_registered_frames']} of {summary['num_frames']}"
     )
-    print("\n| model | square mm | its sd | planarity | ray gap | mean error px |")
+    print("\n| model | square mm | its sd | planarity | ray gap (mm) | error px |")
     print("|---|---|---|---|---|---|", *boards, sep="\n")
     print("\n| refractive | left: tilt x, y (deg) distance (mm) | right: the same |")
     print("|---|---|---|", *housings, sep="\n")

@@ -12,7 +12,8 @@ from uwsfm.colmap import Model
 from uwsfm.geometry import rigid3
 from uwsfm.rig import Rig
 
-NUM_THREADS = 2
+# One thread: with more, the same seed gives another model each time.
+NUM_THREADS = 1
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,9 @@ def run(data: Path, work: Path, out: Path, rig: Rig) -> SelfCalibrated:
     pairs.write_text(
         "".join(f"{a} {b}\n" for i, a in enumerate(names) for b in names[:i])
     )
-    pycolmap.verify_matches(database_path, pairs)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pycolmap.verify_matches(database_path, pairs, verification)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = NUM_THREADS, 0
     options.extract_colors = False

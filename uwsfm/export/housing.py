@@ -29,6 +29,8 @@ def _comments(model: Model, calibration: CalibrationResult, index: int) -> list[
     cov = calibration.covariance.cameras[index]
     distance = model.scene.ports[index].distance
     lines = []
+    if not calibration.covariance.determined:
+        return ["the images do not determine this housing: no standard deviations"]
     if camera.refine_normal:
         lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
     verdict = distance_verdict(distance, cov, camera.refine_distance)

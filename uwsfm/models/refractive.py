@@ -54,6 +54,10 @@ class RefractiveCamera:
     """
 
     def __init__(self, camera: InAirCamera, port: FlatPort) -> None:
+        if not hasattr(camera, "model_name"):
+            raise InputError(f"camera must be a pycolmap.Camera, got {camera!r}")
+        if not isinstance(port, FlatPort):
+            raise InputError(f"port must be a FlatPort, got {port!r}")
         self._camera = camera
         self._port = port
         self._lens = None

@@ -11,6 +11,8 @@ from typing import TypeVar
 
 import pycolmap
 
+from uwsfm.errors import UwsfmError
+
 Result = TypeVar("Result")
 
 POLL_SECONDS = 0.2
@@ -36,8 +38,18 @@ def opened(database_path: Path) -> Iterator[pycolmap.Database]:
     libraries share a process and with it its file locks, and writes of COLMAP get
     lost, silently (SQLite, "How to corrupt a database file", 2.2.1).
     """
-    with quiet_colmap(), pycolmap.Database.open(database_path) as database:
-        yield database
+    with quiet_colmap():
+        try:
+            database = pycolmap.Database.open(database_path)
+        except RuntimeError:
+            raise damaged(database_path) from None
+        with database:
+            yield database
+
+
+def damaged(path: Path) -> UwsfmError:
+    """A file in the workspace is not what a step wrote."""
+    return UwsfmError(f"{path} is damaged: remove the folder {path.parent}, run again")
 
 
 def remove_database(path: Path) -> None:

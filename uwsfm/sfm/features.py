@@ -156,7 +156,9 @@ def write_enhanced(
             if gray is None:
                 raise InputError(f"image {frames.image_dir / name} cannot be read")
             with replaced_file(target) as partial:
-                quality = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_PNG_COMPRESSION, 1]
+                quality = []
+                if target.suffix.lower() in (".jpg", ".jpeg"):
+                    quality = [cv2.IMWRITE_JPEG_QUALITY, 98]
                 if not cv2.imwrite(str(partial), equalizer.apply(gray), quality):
                     raise UwsfmError(f"the enhanced image {target} cannot be written")
         progress("enhancing images", done, len(names))

@@ -16,7 +16,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.rig import Rig
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"})
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 MIN_FRAMES = 2
 
 
@@ -72,7 +72,8 @@ def find_frames(image_dir: Path, rig: Rig) -> Frames:
     """
     image_dir = Path(image_dir)
     if not image_dir.is_dir():
-        raise InputError(f"image directory {image_dir} does not exist")
+        what = "is not a folder" if image_dir.exists() else "does not exist"
+        raise InputError(f"image directory {image_dir} {what}")
     found = {c.images: _images_of(image_dir, c.images, c.name) for c in rig.cameras}
     common = set.intersection(*found.values())
     if not common:
@@ -144,6 +145,28 @@ def check_images(
                 pool.shutdown(cancel_futures=True)
                 raise InputError(fault)
             progress("checking images", done, len(names))
+
+
+def check_masks(frames: Frames, rig: Rig, mask_dir: Path) -> None:
+    """Every image needs a mask of its size: ``<mask_dir>/left/0001.jpg.png``.
+
+    Raises:
+        InputError: a mask that is missing, cannot be decoded, or has another size.
+    """
+    sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
+    for name in frames.image_names():
+        path = Path(mask_dir) / f"{name}.png"
+        if not path.is_file():
+            raise InputError(f"mask {path} of image {name} does not exist")
+        mask = read_gray(path)
+        if mask is None:
+            raise InputError(f"mask {path} cannot be read: it is not an image")
+        width, height = sizes[name.rpartition("/")[0]]
+        if mask.shape != (height, width):
+            raise InputError(
+                f"mask {path} has {mask.shape[1]} x {mask.shape[0]} pixels, but its "
+                f"image has {width} x {height}"
+            )
 
 
 def image_fault(path: Path, size: tuple[int, int]) -> str | None:

@@ -93,6 +93,15 @@ class StartOptions:
     num_threads: int = -1
     """-1: all cores."""
 
+    def __post_init__(self) -> None:
+        if self.num_threads == 0 or self.num_threads < -1:
+            raise InputError(
+                f"num_threads must be positive, or -1 for all cores, "
+                f"got {self.num_threads}"
+            )
+        if self.seed < 0:
+            raise InputError(f"seed must not be negative, got {self.seed}")
+
     @property
     def threads(self) -> int:
         """How many threads that is on this machine."""

@@ -16,7 +16,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import opened
+from uwsfm.sfm.background import damaged, opened
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.mapping_database import indices_of
 from uwsfm.sfm.pinhole_fit import VirtualPinhole
@@ -97,8 +97,15 @@ def write_start(
 def load_start(
     model_path: Path, features_path: Path, frames: Frames
 ) -> PerspectiveStart:
-    """Read what `write_start` wrote; the model itself stays on disk."""
-    content = json.loads((model_path / START_FILE).read_text(encoding="utf-8"))
+    """Read what `write_start` wrote; the model itself stays on disk.
+
+    Raises:
+        UwsfmError: the file is damaged.
+    """
+    try:
+        content = json.loads((model_path / START_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise damaged(model_path / START_FILE) from None
     pinholes = []
     for entry in content["pinholes"]:
         entry["center_in_cam"] = np.array(entry["center_in_cam"])
@@ -122,7 +129,10 @@ def read_start(start: PerspectiveStart) -> StartArrays:
         UwsfmError: a frame of the model lacks an image or its pose.
     """
     frames = start.frames
-    model = pycolmap.Reconstruction(start.model_path)
+    try:
+        model = pycolmap.Reconstruction(start.model_path)
+    except (RuntimeError, ValueError, MemoryError):
+        raise damaged(start.model_path) from None
     frame_of: dict[int, int] = {}  # index in `frames` -> COLMAP's frame id
     for frame_id in model.reg_frame_ids():
         ids = [data_id.id for data_id in model.frames[frame_id].image_ids]

@@ -30,7 +30,7 @@ SAME_TURN_DEG = 0.75
 """Tilted ports turn rays by so much: explanations closer than that are both named."""
 POSE_HINT = (
     "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
-    "the axes of translation_m"
+    "the axes of translation_m, and that images of equal names were taken together"
 )
 
 

@@ -21,7 +21,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import ENHANCED, extract_features, store_intrinsics
-from uwsfm.sfm.images import Frames, check_images, find_frames
+from uwsfm.sfm.images import Frames, check_images, check_masks, find_frames
 from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
@@ -193,6 +193,8 @@ def _match_images(
 
     def extract() -> None:
         check_images(frames, rig, num_threads=options.threads, progress=progress)
+        if options.features.mask_dir is not None:
+            check_masks(frames, rig, options.features.mask_dir)
         extract_features(
             frames,
             rig,
@@ -318,7 +320,7 @@ def _summary(
         )
     if others:
         warnings.append(
-            f"{len(others)} smaller models were left out, of "
+            f"smaller models were left out ({len(others)}), of "
             f"{', '.join(str(size) for size in others[:10])} frames"
         )
     focal = float(np.mean([pinhole.focal_px for pinhole in fixed.pinholes]))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from uwsfm._files import replaced_file
+from uwsfm._files import PARTIAL, replaced_file
 
 FILE_NAME = "steps.json"
 FORMAT = 1
@@ -103,7 +103,7 @@ class Steps:
 
 def _remove_partial_outputs(work_dir: Path) -> None:
     """What `replaced_file` and `replaced_dir` of a killed process could not remove."""
-    for path in work_dir.glob(".*"):
+    for path in work_dir.glob(f"{PARTIAL}*"):
         if path.is_dir():
             shutil.rmtree(path)
         else:
