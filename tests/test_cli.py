@@ -122,6 +122,10 @@ def test_reconstruct_never_clears_a_foreign_folder(tmp_path):
 
 def test_two_runs_do_not_share_a_folder(tmp_path):
     run("init", "rig.yaml", cwd=tmp_path)
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        for name in ("1.png", "2.png"):
+            (tmp_path / folder / name).write_bytes(b"")
     (tmp_path / "out" / WORK).mkdir(parents=True)
     with FileLock(tmp_path / "out" / WORK / "lock"):
         _one_sentence(
