@@ -53,13 +53,13 @@ def draw_cloud(axes, model: uwsfm.Model) -> None:
     axes.scatter(*points.T, c=colors, s=5.0, linewidths=0, depthshade=False)
     for outline in frusta:
         axes.plot(*outline.T, color="#d9480f", linewidth=0.7, alpha=0.9)
-    low, high = np.percentile(points, [1, 99], axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     reach = np.max([np.abs(f[0]) for f in frusta], axis=0)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], reach[2] + 0.1)
     axes.set_box_aspect(
-        (high[0] - low[0], high[1] - low[1], reach[2] + 0.1 - low[2]), zoom=1.2
+        (high[0] - low[0], high[1] - low[1], reach[2] + 0.1 - low[2]), zoom=1.1
     )
     axes.view_init(elev=34, azim=-62)
     axes.set_xlabel("m", labelpad=-4)
@@ -70,9 +70,8 @@ def draw_cloud(axes, model: uwsfm.Model) -> None:
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.pane.set_visible(False)
     frames, count = model.scene.num_frames, model.scene.num_points
-    axes.set_title(
-        f"{count} points and {frames} stereo poses, metric", fontsize=10, y=0.96
-    )
+    title = f"{count} points and {frames} stereo poses, metric"
+    axes.figure.text(0.68, 0.955, title, fontsize=10, ha="center")
 
 
 def draw_distances(axes, summary: dict, truth: dict) -> None:
