@@ -67,9 +67,9 @@ def reconstruct(
 ) -> ReconstructResult:
     """Reconstruct a dive: features, perspective start, refractive optimum, files.
 
-    The steps before the refractive adjustment keep their results in ``out/work``: a run
-    that was stopped goes on where it was, and a run with other settings repeats what
-    they change.
+    The steps before the refractive adjustment keep their results in the workspace
+    ``out/uwsfm-work``: a run that was stopped goes on where it was, and one with other
+    settings repeats what they change.
 
     Args:
         rig: A rig, or the path of a rig file.
