@@ -217,7 +217,8 @@ def _summary(
     timings: dict[str, float],
 ) -> dict[str, Any]:
     perspective = dict(start.summary)
-    warnings = perspective.pop("warnings") + _housing_warnings(model, refined)
+    cameras = housing_summary(model, refined.calibration)
+    warnings = perspective.pop("warnings") + _housing_warnings(cameras, refined)
     del perspective["timings_s"]
     found = errors_summary(model, refined.calibration)
     after = found.pop("reprojection_rms_px")
@@ -226,7 +227,7 @@ def _summary(
         "unregistered_frames": perspective.pop("unregistered_frames"),
         **found,
         "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},
-        "cameras": housing_summary(model, refined.calibration),
+        "cameras": cameras,
         "baseline_m": model.rig.baseline_m,
         "baseline_stddev_m": model.rig.baseline_stddev_m,
         "perspective_start": perspective,
@@ -236,10 +237,10 @@ def _summary(
     }
 
 
-def _housing_warnings(model: Model, refined: Refined) -> list[str]:
+def _housing_warnings(cameras: list[dict], refined: Refined) -> list[str]:
     """What the images do not tell about the housings, one sentence each."""
     warnings = []
-    for entry in housing_summary(model, refined.calibration):
+    for entry in cameras:
         verdict = entry["distance_verdict"]
         if verdict in ("determined", "held"):
             continue

@@ -8,15 +8,19 @@ from numpy.typing import NDArray
 from uwsfm.calibration.problem import CameraCovariance, Covariance
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
-from uwsfm.solver import schur
 from uwsfm.solver.clustered import clustered_covariance
-from uwsfm.solver.covariance import point_covariances, reduced_covariance
+from uwsfm.solver.covariance import (
+    ReducedCovariance,
+    point_covariances,
+    reduced_covariance,
+)
 from uwsfm.solver.layout import Layout
 from uwsfm.solver.levenberg_marquardt import (
     LengthPriors,
     LevenbergMarquardtOptions,
     Problem,
 )
+from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.state import State, translation_arm
 
 # Neighbours err together within a quarter of an image. Fewer, larger clusters would
@@ -59,7 +63,7 @@ def posterior_covariance(optimum: Optimum) -> Covariance:
     points[optimum.used] = variance * point_covariances(layout, eqs, reduced)
     shared = np.full_like(border, np.nan)
     if reduced.determined:
-        shared = _shared_errors(optimum, eqs, reduced.matrix)
+        shared = _shared_errors(optimum, eqs, reduced)
     cameras = []
     for camera, pose in enumerate(optimum.state.cam_from_rig):
         cols, at_zero = optimum.columns[camera], bool(optimum.at_zero[camera])
@@ -76,17 +80,18 @@ def posterior_covariance(optimum: Optimum) -> Covariance:
     )
 
 
-def _shared_errors(optimum: Optimum, eqs, reduced: Array) -> Array:
+def _shared_errors(
+    optimum: Optimum, eqs: NormalEquations, reduced: ReducedCovariance
+) -> Array:
     """Cluster-robust covariance (B, B) of the border, priors included."""
     layout = optimum.layout
     offset = layout.num_frame_cols
-    _, _, inverses = schur.reduced_system(layout, eqs, 0.0)
     covariance = clustered_covariance(
-        layout, optimum.state.kernel_state(), eqs, inverses, reduced, _clusters(optimum)
+        layout, optimum.state.kernel_state(), eqs, reduced, _clusters(optimum)
     )
     # Residuals are smaller than errors by the share of fitted parameters.
     covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
-    priors = reduced[:, offset + optimum.priors.cols]
+    priors = reduced.matrix[:, offset + optimum.priors.cols]
     covariance += optimum.sigma_px**2 * (priors * optimum.priors.weights) @ priors.T
     return covariance[offset:, offset:]
 

@@ -30,8 +30,6 @@ class Refined:
     scene: Scene
     kept: IndexArray
     """(N',) index of each kept observation among those given."""
-    used: IndexArray
-    """(P',) index of each kept point among those given."""
     calibration: CalibrationResult
     """Of ``scene``: its masks and covariances use ``scene``'s indices."""
     start_rms_px: float
@@ -70,13 +68,13 @@ def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined
     scene = retriangulated(scene, calibrated)
     keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
     start = scene
-    part, used = scene.select(_require(keep, scene))
+    part, _ = scene.select(_require(keep, scene))
     first = calibrate(part, report=report, **options)
     trusted = np.zeros_like(keep)
     trusted[np.nonzero(keep)[0][first.inliers]] = True
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
-    part, used = scene.select(_require(keep, scene))
+    part, _ = scene.select(_require(keep, scene))
     second = calibrate(part, report=report, **options)
     kept = np.nonzero(keep)[0][second.inliers]
     final, still = second.scene.select(second.inliers)
@@ -84,7 +82,6 @@ def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined
     return Refined(
         scene=final,
         kept=kept,
-        used=used[still],
         calibration=_compact(second, final, still),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
     )

@@ -17,6 +17,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.status import VALID
 from uwsfm.residuals.reprojection import BORDER_SIZE, point_in_rig
 from uwsfm.scene import IndexArray
+from uwsfm.solver.covariance import ReducedCovariance
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import (
     KernelState,
@@ -94,19 +95,18 @@ def clustered_covariance(
     layout: Layout,
     state: KernelState,
     eqs: NormalEquations,
-    inverses: Array,
-    reduced: Array,
+    reduced: ReducedCovariance,
     cluster: IndexArray,
 ) -> Array:
     """Covariance (n, n) of frames and border, for errors shared within clusters.
 
     Args:
         layout, state, eqs: the problem at its least-squares optimum.
-        inverses: (P, 3, 3) inverses of the point blocks.
-        reduced: (n, n) inverse of the reduced system, unit noise.
+        reduced: inverse of the reduced system, unit noise.
         cluster: (N,) cluster of each sorted observation, counted from 0.
     """
-    scores = np.zeros((int(cluster.max()) + 1, len(reduced)))
-    _scores(layout, state, eqs, inverses, cluster, layout.num_frame_cols, scores)
-    half = reduced @ scores.T
+    scores = np.zeros((int(cluster.max()) + 1, len(reduced.matrix)))
+    offset = layout.num_frame_cols
+    _scores(layout, state, eqs, reduced.inverses, cluster, offset, scores)
+    half = reduced.matrix @ scores.T
     return half @ half.T

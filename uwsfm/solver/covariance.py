@@ -24,8 +24,8 @@ class ReducedCovariance:
     matrix: Array
     """(n, n) frames, then border; NaN everywhere if singular."""
     determined: bool
-    weakest: Array
-    """(n,) the weakest direction in the scaled parameters; for messages."""
+    inverses: Array
+    """(P, 3, 3) inverses of the point blocks that the elimination used."""
 
     def border(self, layout: Layout) -> Array:
         """(B, B) block of rig and ports, marginal over poses and points."""
@@ -46,7 +46,7 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
 
     The observations' noise is taken as 1 px: multiply by the noise variance.
     """
-    lower, _, _ = schur.reduced_system(layout, eqs, 0.0)
+    lower, _, inverses = schur.reduced_system(layout, eqs, 0.0)
     matrix = lower + np.tril(lower, -1).T
     size = len(matrix)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
@@ -61,7 +61,7 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
     return ReducedCovariance(
         matrix=inverse,
         determined=determined,
-        weakest=vectors[:, 0] if size else np.zeros(0),
+        inverses=inverses,
     )
 
 
