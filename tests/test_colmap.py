@@ -84,7 +84,7 @@ def test_point_errors_are_the_refractive_ones(model):
 
 def test_output_folder_reads_back(model, tmp_path):
     export_colmap(model, tmp_path / "sparse")
-    export_housing(model, tmp_path / "housing.yaml")
+    export_housing(model.rig, tmp_path / "housing.yaml")
     again = read_model(tmp_path)
     assert again.frame_names == model.frame_names
     assert again.scene.num_observations == model.scene.num_observations

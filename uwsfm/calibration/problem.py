@@ -267,3 +267,5 @@ class CalibrationResult:
     """(N,) observations that took part in the last solve."""
     summary: CalibrateSummary
     covariance: Covariance
+    options: CalibrateOptions
+    """That were asked for."""
