@@ -108,8 +108,8 @@ def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]
     geometry = Geometry.of(result.scene.select(result.inliers)[0])
     at_zero = tuple(
         f"the images put the port of {name} behind its camera, so its distance was "
-        "held at zero: they contradict the lens calibrated in air (is it valid up to "
-        "the image corners?) or the water index"
+        "held at zero: either they do not determine it, or they contradict the lens "
+        "calibrated in air (is it valid up to the image corners?) or the water index"
         for name, camera in zip(names, covariance.cameras, strict=True)
         if camera.distance_at_zero
     )
