@@ -14,7 +14,7 @@ import numpy as np
 import self_calibrated
 import yaml
 from board import BoardChecks, check_boards, pinhole_rays
-from budget import error_budget, recalibration
+from budget import budget_table, recalibration
 
 import uwsfm
 from uwsfm.console import ProgressBars
@@ -159,7 +159,7 @@ def main() -> None:
         f"{pinhole.common_error(result.model):.3f} px, "
         f"self-calibrated {pinhole.common_own_error(result.model):.3f} px\n"
     )
-    print(error_budget(result.model, rig.refine_cam_from_rig))
+    print(budget_table(result.model, rig.refine_cam_from_rig))
     print(f"\n{recalibration(data)}")
 
 
