@@ -1,4 +1,4 @@
-"""What errors of the given numbers would do to the estimates, and how large they are."""
+"""What errors of the given numbers would do, and how large such errors are."""
 
 import json
 from pathlib import Path
@@ -18,8 +18,9 @@ def budget_table(model: Model, refine_cam_from_rig: bool) -> str:
     ]
     for row in rows:
         cells = []
+        sign = "" if row is rows[-1] else "+"
         for shift in row.shifts:
-            cells += [f"{shift.tilt_deg:.2f}", f"{1e3 * shift.distance_m:+.1f}"]
+            cells += [f"{shift.tilt_deg:.2f}", f"{1e3 * shift.distance_m:{sign}.1f}"]
         lines.append(f"| {row.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
