@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uwsfm import Model, error_budget
+from uwsfm import CalibrationResult, error_budget
 
 
-def budget_table(model: Model, refine_cam_from_rig: bool) -> str:
+def budget_table(calibration: CalibrationResult) -> str:
     """Shifts of tilts and distances when a given number is wrong in both cameras."""
-    rows = error_budget(model.scene, refine_cam_from_rig=refine_cam_from_rig)
+    rows = error_budget(calibration)
     lines = [
         "| if this were so | left: tilt deg | distance mm | right: tilt | distance |",
         "|---|---|---|---|---|",
