@@ -67,6 +67,8 @@ def calibrate(
     if settings.loss != "l2":
         sigma = solved.robust_sigma()
         solved = run.solve(solved.state, run.prune(solved.state, sigma), "l2", sigma)
+    elif run.priors(1.0) is not None:  # they were weighed for a noise of 1 px
+        solved = run.solve(solved.state, everything, "l2", solved.sigma())
     summary = _summary(run, solved, time.perf_counter() - began)
     return CalibrationResult(
         scene=solved.state.to_scene(scene),
