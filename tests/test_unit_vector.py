@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwsfm.geometry.unit_vector import angle_between, plus, tangent_basis
+from uwsfm.geometry.unit_vector import angle_between, minus, plus, tangent_basis
 
 SPECIAL = [
     (0.0, 0.0, 1.0),
@@ -38,6 +38,16 @@ def test_step_length_is_the_angle_turned_and_its_start_is_the_basis(rng):
         tiny = plus(n, 1e-9 * delta) - n
         np.testing.assert_allclose(tiny, 1e-9 * tangent_basis(n) @ delta, atol=3e-16)
     np.testing.assert_array_equal(plus(SPECIAL[0], (0.0, 0.0)), SPECIAL[0])
+
+
+def test_minus_is_the_step_that_plus_takes(rng):
+    for n in random_directions(rng):
+        step = rng.normal(size=2)
+        step *= rng.uniform(0.0, 3.0) / np.linalg.norm(step)  # short of the antipode
+        for delta in (step, 1e-6 * step, 1e-12 * step):
+            # Coordinates are exact to 1e-16; at 3 rad the angle's sine is 0.14 of it.
+            np.testing.assert_allclose(minus(plus(n, delta), n), delta, atol=1e-14)
+        np.testing.assert_allclose(minus(n, n), 0.0, atol=1e-15)
 
 
 def test_angles_keep_their_digits_near_zero_and_pi():

@@ -103,7 +103,7 @@ def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covaria
         InputError: an unknown option, or observations that cannot be made.
     """
     settings = CalibrateOptions.parsed(options)
-    if not noise_px > 0.0:
+    if not 0.0 < noise_px < np.inf:
         raise InputError(f"noise_px must be positive, got {noise_px}")
     pixels, valid = scene.projections()
     if not np.all(valid):
