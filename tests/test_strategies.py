@@ -158,7 +158,7 @@ def test_error_in_space_leaves_out_what_one_camera_sees():
     [
         ({"error": "pixels"}, "error must be one of .*point_3d, got 'pixels'"),
         ({"strategy": "both"}, "strategy must be one of joint, nested, got 'both'"),
-        *(({"error": name}, "give refine_distances=False") for name in METRIC),
+        *(({"error": name}, "hold the distances") for name in METRIC),
         ({"strategy": "nested", "refine_focal": True}, "refine_focal needs the repro"),
         (
             {
