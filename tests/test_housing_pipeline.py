@@ -97,6 +97,28 @@ def test_refined_water_and_lenses_arrive_in_the_housing(dive, tmp_path):
     assert {"fx of left", "fy of left", "fx of right", "fy of right"} < set(entries)
 
 
+def test_priors_are_around_the_rig_file_not_around_a_first_result(dive, tmp_path):
+    """The port at 10 mm, known to a tenth of a millimetre: so near it must stay."""
+    folder, _ = dive
+    tight = {"distance_stddev_m": 1e-5}
+    result = calibrate_housing(folder / "rig.yaml", folder, tmp_path, **tight)
+    for port in result.calibration.scene.ports:
+        # The images pull by 10 mm with a standard deviation of 0.5: 4 microns.
+        assert port.distance == pytest.approx(0.010, abs=2e-5)
+
+
+def test_a_model_of_other_images_is_refused(dive, tmp_path):
+    folder, _ = dive
+    rig = uwsfm.load_rig(folder / "rig.yaml")
+    larger = sample_rig(image_scale=2.0)
+    pairs = zip(rig.cameras, larger.cameras, strict=True)
+    rig = replace(
+        rig, cameras=tuple(replace(mine, camera=other.camera) for mine, other in pairs)
+    )
+    with pytest.raises(uwsfm.InputError, match="800 x 600 pixels there, camera "):
+        calibrate_housing(rig, folder, tmp_path / "out")
+
+
 @pytest.fixture(scope="module")
 def one_pair(tmp_path_factory) -> Path:
     """The first pair of the rendered sample."""
@@ -123,8 +145,10 @@ def test_one_pair_gives_normals_if_the_distances_are_given(one_pair, tmp_path):
         angle = unit_vector.angle_between(port.normal, item.port.normal)
         # 0.026 degrees of noise, and SIFT's own bias of a few hundredths.
         assert np.degrees(angle) < 0.1
-    verdicts = {camera["distance_verdict"] for camera in result.summary["cameras"]}
-    assert verdicts == {"held"}
+    for camera in result.summary["cameras"]:
+        assert camera["distance_verdict"] == "held"
+        assert camera["cam_from_rig"]["rotation_stddev_deg"] is None
+    assert "taken as given" in result.summary["warnings"][0]
 
 
 def test_one_pair_is_not_asked_for_a_distance(one_pair, tmp_path):
@@ -144,6 +168,8 @@ def test_one_pair_is_not_asked_for_a_distance(one_pair, tmp_path):
         ({"error": "virtual_camera"}, "hold the distances"),
         ({"error": "point_3d", "refine_focal": True}, "needs the reprojection error"),
         ({"focal_stddev": -1.0}, "focal_stddev must be positive"),
+        ({"focal_stddev": 1e-3}, "has no effect: the focal length is not refined"),
+        ({"distance_stddev_m": 1e-3, "strategy": "nested"}, "needs the joint strategy"),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_is_written(

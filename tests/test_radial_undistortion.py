@@ -181,6 +181,7 @@ def test_the_error_is_told_where_results_are(tmp_path):
     calibration = SimpleNamespace(
         covariance=SimpleNamespace(cameras=[unknown] * 2),
         scene=SimpleNamespace(cam_from_rig=rig.cam_from_rig, ports=ports),
+        options=SimpleNamespace(refine_cam_from_rig=True),
     )
     entries = housing_summary(rig, calibration)
     keys = "lens_conversion_max_px", "lens_conversion_rms_px"

@@ -213,10 +213,14 @@ def _priors(texts: Iterable[str]) -> dict[str, float]:
         key, _, value = text.partition("=")
         if key not in PRIORS:
             raise InputError(f"--prior {text}: the key is one of {', '.join(PRIORS)}")
+        if key in found:
+            raise InputError(f"--prior {text}: {key} is given twice")
         try:
             found[key] = float(value)
         except ValueError:
-            raise InputError(f"--prior {text}: {value!r} is not a number") from None
+            raise InputError(
+                f"--prior {text}: {value!r} is not a number; write KEY=VALUE"
+            ) from None
     return found
 
 

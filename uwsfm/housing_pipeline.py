@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import pycolmap
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
@@ -95,7 +96,8 @@ def calibrate_housing(
             f"start must be one of {', '.join(get_args(Start))}, got {start!r}"
         )
     merged = {**rig_options(rig), **options}
-    CalibrateOptions.parsed(merged)  # a wrong option fails before anything is written
+    # A wrong option fails before anything is written.
+    _require_effect(CalibrateOptions.parsed(merged))
     source, out = Path(source), output_folder(out)
     if (out / SPARSE).exists():
         raise InputError(
@@ -148,7 +150,9 @@ class _Job:
 
     def _from_model(self, folder: Path) -> Scene:
         """The model's poses and tracks, scaled to the rig's baseline."""
-        scene = from_reconstruction(read_reconstruction(folder), self.rig).scene
+        reconstruction = read_reconstruction(folder)
+        _require_raw_images(folder, reconstruction, self.rig)
+        scene = from_reconstruction(reconstruction, self.rig).scene
         baseline = np.linalg.norm(scene.cam_from_rig[1, 4:])
         if not baseline > 0.0:
             raise InputError(f"{folder}: the rig of the model has no baseline")
@@ -173,7 +177,16 @@ class _Job:
         options = {**self.options, **PAIRS_HOLD}
         first = calibrate(scene, **options)
         found = without_wrong_matches(replace(scene, cameras=first.scene.cameras))
-        return calibrate(found, **options)
+        return calibrate(found, known=scene, **options)
+
+    def _notes(self) -> list[str]:
+        """What was taken for granted, one sentence each."""
+        if self.start != "pairs":
+            return []
+        return [
+            "single stereo pairs tell the normals only: cam_from_rig and the port "
+            "distances were taken as given"
+        ]
 
     def _finish(self, calibration: CalibrationResult) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
@@ -189,7 +202,7 @@ class _Job:
             **errors_summary(calibration),
             "cameras": housing_summary(rig, calibration),
             "refined": refined_summary(rig, calibration),
-            "warnings": housing_warnings(rig, calibration),
+            "warnings": self._notes() + housing_warnings(rig, calibration),
             "error_budget": budget_summary(budget),
             "versions": versions(),
         }
@@ -214,8 +227,44 @@ def _require_distances_held(
         raise InputError(
             f"cameras[{index}].port.refine: the distance of a port cannot be estimated "
             f"from {what}, because for every distance there are points that fit; "
-            "give the distance and write refine: [normal], or use more frames"
+            "give the distances and write refine: [normal] for every camera, or "
+            f"{'use more frames' if num_frames == 1 else 'take another start'}"
         )
+
+
+def _require_effect(options: CalibrateOptions) -> None:
+    """Refuse what is known of a number that is not refined."""
+    refined = {
+        "distance_stddev_m": ("the port distances", options.refine_distances),
+        "normal_stddev_deg": ("the port normals", options.refine_normals),
+        "water_index_stddev": ("the water index", options.refine_water_index),
+        "focal_stddev": ("the focal length", options.refine_focal),
+        "principal_point_stddev_px": (
+            "the principal point",
+            options.refine_principal_point,
+        ),
+        "distortion_stddev": ("the distortion", options.refine_distortion),
+    }
+    for name, (what, wanted) in refined.items():
+        if getattr(options, name) is not None and not np.any(wanted):
+            raise InputError(f"{name} has no effect: {what} is not refined")
+
+
+def _require_raw_images(
+    folder: Path, reconstruction: pycolmap.Reconstruction, rig: Rig
+) -> None:
+    """Refuse models of undistorted or reduced images: their pixels are others."""
+    for image in reconstruction.images.values():
+        seen = reconstruction.cameras[image.camera_id]
+        for item in rig.cameras:
+            size = item.camera.width, item.camera.height
+            mine = image.name.startswith(f"{item.images}/")
+            if mine and (seen.width, seen.height) != size:
+                raise InputError(
+                    f"{folder}: image {image.name} has {seen.width} x {seen.height} "
+                    f"pixels there, camera {item.name!r} of the rig has {size[0]} x "
+                    f"{size[1]}: give a model of the raw images"
+                )
 
 
 def _model_folder(source: Path) -> Path | None:

@@ -255,6 +255,11 @@ def _summary(
 def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
     """What the images do not tell about the housings, one sentence each."""
     warnings = list(verdicts(calibration, [camera.name for camera in rig.cameras]))
+    if calibration.options.error_name == "point_3d":
+        warnings.append(
+            "the error in space is far more sensitive to noise than the reprojection "
+            "error, and biased: its result is for comparison only"
+        )
     if not calibration.summary.converged:
         warnings.append("the refractive adjustment stopped before it converged")
     return warnings

@@ -42,7 +42,11 @@ MIN_NOISE_PX = 0.01
 
 
 def calibrate(
-    scene: Scene, *, report: Report | None = None, **options
+    scene: Scene,
+    *,
+    known: Scene | None = None,
+    report: Report | None = None,
+    **options,
 ) -> CalibrationResult:
     """Refine the housing, the rig, the poses and the points of a scene.
 
@@ -51,6 +55,7 @@ def calibrate(
 
     Args:
         scene: the start values, at least two frames.
+        known: a scene with the values that priors are around; default: the start.
         report: called after every step with (iteration, cost).
         **options: fields of `CalibrateOptions`.
 
@@ -62,7 +67,7 @@ def calibrate(
     _check(scene, settings)
     began = time.perf_counter()
     everything = np.ones(scene.num_observations, dtype=bool)
-    run = _Run(scene, settings, report)
+    run = _Run(scene, scene if known is None else known, settings, report)
     solved = run.solve(State.from_scene(scene), everything, settings.loss)
     if settings.loss != "l2":
         sigma = solved.robust_sigma()
@@ -171,9 +176,14 @@ class _Run:
     """The scene and settings that the solves of one calibration share."""
 
     def __init__(
-        self, scene: Scene, settings: CalibrateOptions, report: Report | None
+        self,
+        scene: Scene,
+        known: Scene,
+        settings: CalibrateOptions,
+        report: Report | None,
     ) -> None:
         self.scene = scene
+        self.known = known
         self.settings = settings
         self.report = report
         self.at_zero = np.zeros(len(scene.cameras), dtype=bool)
@@ -245,7 +255,7 @@ class _Run:
         return np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
 
     def priors(self, sigma_px: float) -> Priors | None:
-        return border_priors(self.scene, self.settings, self.columns, sigma_px)
+        return border_priors(self.known, self.settings, self.columns, sigma_px)
 
 
 def _check_normals(state: State) -> None:

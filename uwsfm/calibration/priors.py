@@ -19,7 +19,7 @@ def border_priors(
     """Priors around a scene's values, weighed against observations of this noise.
 
     Args:
-        scene: the start, whose values are what is known.
+        scene: its values are what is known.
         settings: how well.
         columns: (C, BORDER_SIZE); what is held needs no prior.
         sigma_px: noise of one image coordinate.

@@ -116,6 +116,13 @@ class CalibrateOptions:
 
     def _check_error(self) -> None:
         """Refuse what another error than reprojection does not determine."""
+        given = [name for name in PRIORS if getattr(self, name) is not None]
+        pixels = self.strategy == "joint" and self.error_name == "reprojection"
+        if given and not pixels:
+            raise InputError(
+                f"{given[0]} needs the joint strategy and the reprojection error: "
+                "elsewhere it cannot be weighed against the noise of the images"
+            )
         if self.error_name == "reprojection":
             return
         for name in ("refine_focal", "refine_principal_point", "refine_distortion"):

@@ -41,6 +41,6 @@ def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} mm, "
             f"{verdict} by the images"
         )
-    if index > 0:
+    if index > 0 and calibration.options.refine_cam_from_rig:
         lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
     return lines

@@ -40,6 +40,7 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
         cov = calibration.covariance.cameras[index]
         pose = calibration.scene.cam_from_rig[index]
         port = calibration.scene.ports[index]
+        turned = index > 0 and calibration.options.refine_cam_from_rig
         entries.append(
             {
                 "name": camera.name,
@@ -63,9 +64,9 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
                 "cam_from_rig": {
                     "rotation_xyzw": pose[:4].tolist(),
                     "translation_m": pose[4:].tolist(),
-                    "rotation_stddev_deg": _stddev(cov.rotation_stddev_deg, index > 0),
+                    "rotation_stddev_deg": _stddev(cov.rotation_stddev_deg, turned),
                     "translation_stddev_m": [
-                        _stddev(value, index > 0) for value in cov.translation_stddev_m
+                        _stddev(value, turned) for value in cov.translation_stddev_m
                     ],
                 },
             }

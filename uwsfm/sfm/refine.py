@@ -84,7 +84,7 @@ def refine_scene(
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     part, _ = scene.select(_require(keep, scene))
-    second = calibrate(part, report=report, **options)
+    second = calibrate(part, known=start, report=report, **options)
     kept = np.nonzero(keep)[0][second.inliers]
     final, still = second.scene.select(second.inliers)
     before = start.residuals()[kept]
