@@ -3,7 +3,7 @@
 Rig poses, cam_from_rig, port normals and distances and the points move together on the
 reprojection error in true pixels. Staging (normals first, then distances) converges
 less often, and the nested scheme of Sedlazeck & Koch (BMVC 2011, fig. 5), which is
-`strategies.minimize_nested`, reaches the same optimum a hundred times slower.
+`strategies.minimize_nested`, reaches no better optimum, far slower.
 """
 
 import time

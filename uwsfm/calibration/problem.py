@@ -48,7 +48,9 @@ class CalibrateOptions:
     """1e-2 if the normals may be more than 30 degrees off."""
     strategy: str = "joint"
     """"joint": everything moves together; "nested": the loops of the paper's fig. 5,
-    which reach the same optimum a hundred times slower."""
+    some ten times slower, with the same end where the motion is rich. On a
+    straight or level track their distances scatter more; with
+    "virtual_camera_tangential" they are several standard deviations too long there."""
     error: str | None = None
     """What is minimised: "reprojection" (pixels), "virtual_camera" or
     "virtual_camera_tangential" (metres on the port; the paper's eq. 6-10, centred on
