@@ -167,7 +167,7 @@ def test_unsupported_lens_is_named(tmp_path):
     [
         (["--prior", "distance=1"], "--prior distance=1: the key is one of distance_s"),
         (["--prior", "focal_stddev=a"], "'a' is not a number"),
-        (["--error", "point_3d"], "strategy='nested'"),
+        (["--error", "point_3d"], "hold the distances"),
         (
             ["--strategy", "nested", "--refine", "focal", "-o", "x"],
             "refine_focal needs",

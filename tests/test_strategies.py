@@ -156,6 +156,7 @@ def test_error_in_space_leaves_out_what_one_camera_sees():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"error": "point_3d", "strategy": "nested"}, "nested loops anywhere"),
         ({"error": "pixels"}, "error must be one of .*point_3d, got 'pixels'"),
         ({"strategy": "both"}, "strategy must be one of joint, nested, got 'both'"),
         *(({"error": name}, "hold the distances") for name in METRIC),

@@ -133,6 +133,11 @@ class CalibrateOptions:
                     f"{name} needs the reprojection error: in {self.error_name} the "
                     "pixels' rays in air are given"
                 )
+        if self.error_name == "point_3d" and self.strategy == "nested":
+            raise InputError(
+                "error 'point_3d' does not lead the nested loops anywhere, not even on "
+                "exact data: hold the distances, or take a virtual camera"
+            )
         if self.error_name == "point_3d" and self.baseline_stddev_m > 0.0:
             raise InputError(
                 "error 'point_3d' is measured in metres, which a free baseline "
