@@ -1,6 +1,5 @@
 """How far off the ports may start: the basin of the joint adjustment."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 

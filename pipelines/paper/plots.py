@@ -22,6 +22,7 @@ COLORS = {
     "nested": ORANGE,
     "left": BLUE,
     "right": ORANGE,
+    "joint, 30 mm of glass": TEAL,
 }
 """The same thing has the same colour in all figures."""
 

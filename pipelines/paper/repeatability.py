@@ -3,7 +3,6 @@
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +52,7 @@ def trials(work: Path, tank: Path | None) -> list[Row]:
         work: Keeps images and features for the next time.
         tank: Folder of the real rig's images; None leaves them out.
     """
-    rows = _paper_rows()
+    rows = paper_rows()
     with ProgressBars() as progress:
         if tank is not None:
             rig = _tank_rig(tank, work)
@@ -149,7 +148,7 @@ def _stereo_rows(data: str, number: int, rig: Rig, folder: Path) -> list[Row]:
     ]
 
 
-def _paper_rows() -> list[Row]:
+def paper_rows() -> list[Row]:
     rows = []
     for camera, rows_deg in PAPER_TRIALS_DEG.items():
         for number, (azimuth, tilt) in enumerate(rows_deg, start=1):

@@ -10,6 +10,9 @@ from uwsfm._files import replaced_file
 Row = dict[str, Any]
 """One line of a table: column name with its unit -> number or text."""
 
+Tables = dict[str, list[Row]]
+"""By name, which is that of the CSV file."""
+
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
     """Write a table, numbers with six digits; the file is replaced as a whole."""

@@ -1,0 +1,189 @@
+"""Figure 7: ports from many pairs, by noise and strategy, against the bound."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import basin
+import many_pairs
+import numpy as np
+from plots import COLORS, bars, new_figure, save
+from settings import Settings
+from tables import Row, Tables, column, markdown, select
+
+TABLES = ("fig7", "fig7_basin")
+SERIES = {
+    "joint": ("glass 5 mm", "joint"),
+    "nested": ("glass 5 mm", "nested"),
+    "joint, 30 mm of glass": ("glass 30 mm", "joint"),
+}
+
+
+def compute(settings: Settings) -> Iterator[tuple[str, list[Row]]]:
+    yield "fig7", many_pairs.table(settings.runs, settings.processes)
+    yield "fig7_basin", basin.table(max(settings.runs // 4, 2), settings.processes)
+
+
+def plot(found: Tables, out: Path) -> None:
+    figure = new_figure(11.0, 3.5)
+    normal, distance, ratio = figure.subplots(1, 3)
+    for index, (name, (case, strategy)) in enumerate(SERIES.items()):
+        rows = select(found["fig7"], case=case, strategy=strategy)
+        noise = column(rows, "noise_px")
+        shift = 0.018 * (index - 1)
+        for axes, mean, stddev in (
+            (normal, "normal_mean_deg", "normal_sd_deg"),
+            (distance, "distance_mean_error_mm", "distance_sd_mm"),
+        ):
+            bars(axes, noise, column(rows, mean), column(rows, stddev), name, shift)
+        noisy = [row for row in rows if row["noise_px"] > 0.0]
+        for mark, what in (("o", "normal"), ("s", "distance")):
+            ratio.errorbar(
+                np.array(column(noisy, "noise_px")) + shift + 0.008 * (mark == "s"),
+                column(noisy, f"{what}_ratio"),
+                yerr=column(noisy, f"{what}_ratio_error"),
+                fmt=mark,
+                markersize=3.5,
+                capsize=2.5,
+                elinewidth=0.9,
+                color=COLORS[name],
+                label=f"{what}s, {name}",
+            )
+    rows = select(found["fig7"], case="glass 5 mm", strategy="joint")
+    noise, bound = column(rows, "noise_px"), column(rows, "distance_bound_mm")
+    normal.plot(noise, column(rows, "normal_bound_deg"), "k--", linewidth=1.1)
+    for sign in (-1.0, 1.0):
+        distance.plot(noise, sign * np.array(bound), "k--", linewidth=1.1)
+    normal.plot([], [], "k--", linewidth=1.1, label="Cramér-Rao bound (RMS)")
+    ratio.axhspan(0.85, 1.15, color="#e7f5ff", zorder=0)
+    ratio.axhline(1.0, color="black", linewidth=0.8)
+    ratio.set_ylim(0.6, 1.6)
+    _label(normal, "angle between normal and truth", "deg")
+    _label(distance, "distance minus truth (20 mm)", "mm")
+    _label(ratio, "RMSE over bound, and its Monte-Carlo error", "ratio")
+    normal.legend(loc="upper left")
+    ratio.legend(loc="upper right", fontsize=7)
+    save(figure, out / "fig7.png")
+
+
+def _label(axes, title: str, unit: str) -> None:
+    axes.set_title(title)
+    axes.set_xlabel("noise of an image coordinate, px")
+    axes.set_ylabel(unit)
+
+
+def section(found: Tables) -> str:
+    """What the README says."""
+    rows = found["fig7"]
+    exact = select(rows, noise_px=0.0)
+    noisy = [row for row in rows if row["noise_px"] > 0.0]
+    joint = select(rows, case="glass 5 mm", strategy="joint")
+    nested = select(rows, case="glass 5 mm", strategy="nested")
+    common = {
+        "case": ("case", ""),
+        "noise_px": ("noise, px", "g"),
+        "strategy": ("strategy", ""),
+    }
+    return TEXT.format(
+        runs=int(rows[0]["runs"]),
+        points=int(rows[0]["points"]),
+        observations=rows[0]["observations"],
+        start_px=joint[0]["start_px"],
+        start_deg=joint[0]["start_rotation_deg"],
+        accuracy=markdown(
+            noisy,
+            common
+            | {
+                "normal_rmse_deg": ("normal RMSE, deg", ".4f"),
+                "normal_bound_deg": ("bound", ".4f"),
+                "normal_ratio": ("ratio", ".2f"),
+                "normal_ratio_error": ("±", ".2f"),
+                "distance_rmse_mm": ("distance RMSE, mm", ".2f"),
+                "distance_bound_mm": ("bound ", ".2f"),
+                "distance_ratio": ("ratio ", ".2f"),
+                "distance_ratio_error": ("± ", ".2f"),
+            },
+        ),
+        exact=markdown(
+            exact,
+            common
+            | {
+                "normal_max_deg": ("largest normal error, deg", ".1e"),
+                "distance_max_error_mm": ("largest distance error, mm", ".1e"),
+            },
+        ),
+        behaviour=markdown(
+            rows,
+            common
+            | {
+                "z_normal_mean": ("z of normals: mean", ".2f"),
+                "z_normal_sd": ("sd", ".2f"),
+                "z_distance_mean": ("z of distances: mean", ".2f"),
+                "z_distance_sd": ("sd", ".2f"),
+                "converged_percent": ("converged, %", ".0f"),
+                "iterations_mean": ("iterations: mean", ".1f"),
+                "iterations_max": ("max", ".0f"),
+                "solve_median_s": ("solve, s: median", ".2f"),
+                "solve_max_s": ("max", ".2f"),
+            },
+        ),
+        basin=markdown(
+            _basin_lines(found["fig7_basin"]),
+            {"angle": ("normals off by", "")}
+            | {f"{s:g}": (f"distance x {s:g}", "") for s in basin.DISTANCE_SCALES},
+        ),
+        basin_runs=int(found["fig7_basin"][0]["runs"]),
+        slower=_mean(nested, "solve_median_s") / _mean(joint, "solve_median_s"),
+    )
+
+
+def _mean(rows: list[Row], name: str) -> float:
+    return float(np.mean(column(rows, name)))
+
+
+def _basin_lines(rows: list[Row]) -> list[Row]:
+    lines: dict[float, Row] = {}
+    for row in rows:
+        angle = row["normal_off_deg"]
+        line = lines.setdefault(angle, {"angle": f"{angle:g} deg"})
+        line[f"{row['distance_scale']:g}"] = (
+            f"{row['converged_percent']:.0f} % ({row['iterations_max']:.0f})"
+        )
+    return list(lines.values())
+
+
+TEXT = """## Figure 7: ports from many pairs
+
+![Errors of normals and distances against noise, and their ratio to the bound](fig7.png)
+
+15 pairs of a rich motion, {points} points, about {observations:.0f} observations, true
+distances 20 mm, tilts 2 and 1 degrees. Every run has a sea floor and noise of its own
+({runs} runs per line). The start is the paper's: a perspective bundle adjustment of the
+noisy observations (it leaves frame rotations {start_deg:.2f} degrees off), straight
+ports at 10 mm. With these ports the observations miss their points by {start_px:.0f}
+px. RMSE and bound (Cramér and Rao) are pooled over both cameras; ± is the Monte-Carlo
+error of the ratio.
+
+{accuracy}
+
+The outliers' bound is that of the same dive without outliers. With exact observations
+there is nothing to compare with:
+
+{exact}
+
+z: (estimate - truth) / reported standard deviation, which allows for neighbouring
+features that err together, so a spread slightly below 1 is right here. Times are those
+of the solve, two at a time on two cores; the paper reports about 3 hours.
+
+{behaviour}
+
+How far off the ports may start, the rest from the perspective adjustment, at 0.5 px:
+share that converges (and the most iterations), {basin_runs} dives each.
+
+{basin}
+
+**The paper** shows errors of normals and distances of both cameras against noise, after
+3 hours each. **Here** the joint adjustment is at the bound, in a fraction of a second.
+The paper's nested loops reach the same optimum, {slower:.0f} times slower. **Where it
+loses**: nowhere on such data; a flat floor from one altitude leaves the distances
+undetermined, whatever the solver.
+"""
