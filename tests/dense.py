@@ -5,9 +5,11 @@ shared with the accumulation of normal equations by cells.
 """
 
 import numpy as np
+from jacobians import central_differences
 
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import rotmat_from_quat
+from uwsfm.models.lens import NUM_PARAMS, param_slots, with_limit
 from uwsfm.simulate import (
     ObservationOptions,
     Relief,
@@ -31,6 +33,24 @@ def small_scene(num_frames=4, num_points=25, **options) -> SimulatedScene:
 
 def skew(x):
     return np.array([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+
+
+def lens_columns(camera, in_cam):
+    """d(pixel) / d(lens parameters), (2, 12), by a five-point stencil."""
+
+    def pixel(delta):
+        row = camera.lens.copy()
+        row[:NUM_PARAMS] += delta
+        return camera.with_lens(with_limit(row)).img_from_point([in_cam])[0][0]
+
+    used = np.isin(np.arange(NUM_PARAMS), param_slots(camera.camera.model_name))
+    columns = np.zeros((2, NUM_PARAMS))
+    columns[:, used] = central_differences(
+        lambda delta: pixel(np.bincount(np.flatnonzero(used), delta, NUM_PARAMS)),
+        int(used.sum()),
+        1e-4,
+    )
+    return columns
 
 
 def dense_system(scene, layout):
@@ -62,7 +82,11 @@ def dense_system(scene, layout):
                 -j_cam @ skew(turned),
                 length * j_cam @ unit_vector.tangent_basis(direction),
                 j_cam @ direction,
-                j_port[0][:, [3, 4, 5, 8]],  # normal (2), distance, n_water
+                # normal (2), distance, n_water, thickness, n_glass
+                j_port[0][:, [3, 4, 5, 8, 6, 7]],
+                lens_columns(scene.cameras[c], rigid3.transform(cam, in_rig))
+                if layout.free_lens
+                else np.zeros((2, NUM_PARAMS)),
             ]
         )
         for k, column in enumerate(layout.border_col[c]):

@@ -6,6 +6,7 @@ derivations, not two copies.
 
 import numpy as np
 from scipy.optimize import brentq, minimize
+from scipy.spatial.transform import Rotation
 
 
 def plane_axes(normal):
@@ -87,6 +88,34 @@ def paper_water_ray(ray, normal, distance, thickness, n_air, n_glass, n_water):
     reach = (thickness + distance - normal @ inner) / (normal @ in_glass)
     in_water = _refract_by_rotation(in_glass, normal, n_glass, n_water)
     return inner + reach * in_glass, in_water
+
+
+def paper_virtual_error(point, origin, ray, center, normal):
+    """Sedlazeck & Koch (BMVC 2011) eq. 6-10 for one observation: projected - observed.
+
+    Eq. 6 prints R_v as the turn about n x e_z by arccos(n_z), and eq. 7 applies it
+    transposed. That turn maps n to e_z, so that the virtual camera looks along n, as
+    fig. 4 has it, only if it is applied as it is.
+
+    Args:
+        point: (3,) X_w, already in the camera frame (first line of eq. 7).
+        origin, ray: (3,) X_o and the unit direction in the water.
+        center: (3,) C_v, on the caustic.
+        normal: (3,) of the port.
+
+    Returns:
+        (3,) metres, in the virtual camera, and its rotation from the camera frame.
+    """
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    length = np.linalg.norm(axis)
+    unit = axis / length if length > 0.0 else np.zeros(3)
+    virtual_from_cam = Rotation.from_rotvec(np.arccos(normal[2]) * unit).as_matrix()
+    # arccos near 1 gives an angle to 1e-16 / angle only.
+    np.testing.assert_allclose(virtual_from_cam @ normal, [0.0, 0.0, 1.0], atol=1e-14)
+    x_v = virtual_from_cam @ (point - center)
+    x_ov = virtual_from_cam @ (origin - center)
+    f_v = (ray @ normal) * np.linalg.norm(center - origin)
+    return f_v / x_v[2] * x_v - x_ov, virtual_from_cam
 
 
 def air_tangent(height, radius, distance, thickness, n_glass, n_water):

@@ -7,9 +7,9 @@ import pytest
 from dense import dense_system, small_scene
 
 from uwsfm import CalibrateOptions, calibrate
-from uwsfm.calibration.uncertainty import camera_variances
+from uwsfm.calibration.uncertainty import camera_variances, likelihood
+from uwsfm.residuals.border import BORDER_SIZE, WATER_INDEX
 from uwsfm.simulate import perturbed
-from uwsfm.solver import levenberg_marquardt as lm
 from uwsfm.solver.covariance import point_covariances, reduced_covariance
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.state import State
@@ -17,9 +17,9 @@ from uwsfm.solver.state import State
 
 def linearized(scene, options):
     at_zero = np.zeros(len(scene.cameras), dtype=bool)
-    layout = build_layout(scene, options.border_columns(at_zero))
-    problem = lm.Problem(layout, lm.LevenbergMarquardtOptions(), lm.NO_PRIORS)
-    return layout, problem.linearize(State.from_scene(scene))
+    models = [camera.camera.model_name for camera in scene.cameras]
+    layout = build_layout(scene, options.border_columns(models, at_zero))
+    return layout, likelihood(layout, State.from_scene(scene), None)
 
 
 def repeat_observations(scene, rows, shift_px):
@@ -110,8 +110,10 @@ def test_stddevs_of_a_camera_are_read_from_the_right_columns():
     result = calibrate(truth, loss="l2", **options)
     covariance = result.covariance
     # Normal of the left; then rotation, direction and port distance of the right.
-    assert covariance.border_cols[0].tolist() == [HELD] * 6 + [0, 1, HELD, HELD]
-    expected = [2, 3, 4, 5, 6, HELD, HELD, HELD, 7, HELD]
+    nothing = [HELD] * (BORDER_SIZE - WATER_INDEX)
+    expected = [HELD] * 6 + [0, 1, HELD, *nothing]
+    assert covariance.border_cols[0].tolist() == expected
+    expected = [2, 3, 4, 5, 6, HELD, HELD, HELD, 7, *nothing]
     assert covariance.border_cols[1].tolist() == expected
     variance = np.diag(covariance.border)
     left, right = (

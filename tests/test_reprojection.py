@@ -6,8 +6,9 @@ from jacobians import CAMERA_IDS, EXAMPLE_CAMERAS, EXAMPLE_PORTS, check_jacobian
 
 from uwsfm import RefractiveCamera, Status
 from uwsfm.geometry import rigid3, unit_vector
-from uwsfm.models.lens import lens_row
-from uwsfm.residuals.reprojection import BORDER_SIZE, residual, residual_with_jac
+from uwsfm.models.lens import lens_row, param_slots, with_limit
+from uwsfm.residuals.border import BORDER_SIZE, FIRST_LENS
+from uwsfm.residuals.reprojection import residual, residual_with_jac
 from uwsfm.solver.state import translation_arm
 
 
@@ -17,7 +18,7 @@ from uwsfm.solver.state import translation_arm
 )
 def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, rng):
     """Blocks: point in the rig, its frame's pose, rotation, direction and length of
-    cam_from_rig, port normal, distance, water index."""
+    cam_from_rig, port normal, distance, water index, glass, and the lens."""
     quat = rigid3.quat_from_rotvec(0.2 * rng.normal(size=3))
     cam_from_rig = np.concatenate([quat, 0.2 * rng.normal(size=3)])
     xy = 0.6 * np.array([camera.width, camera.height])
@@ -25,11 +26,11 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
     in_cam = origins[0] + 1.5 * dirs[0]
     point = rigid3.transform(rigid3.inverse(cam_from_rig), in_cam)
     lens = lens_row(camera.model_name, camera.params)
-    start = (point, cam_from_rig, port.params)
+    start = (point, cam_from_rig, port.params, lens)
 
     def error(x):
         cam = rigid3.matrix_rows(x[1])
-        status, *pixels = residual(*x[0], xy, cam, lens, x[2])
+        status, *pixels = residual(*x[0], xy, cam, with_limit(x[3]), x[2])
         assert status == Status.VALID
         return np.array(pixels)
 
@@ -41,6 +42,7 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
         translation_arm(cam_from_rig[4:]),
         lens,
         port.params,
+        True,
         np.empty((2, 9)),
         j_rig,
         j_border,
@@ -59,21 +61,48 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
     check(j_border[:, 0:3], _with_rotation)
     check(j_border[:, 3:6], _with_translation)
     check(j_border[:, 6:8], _with_normal)
-    check(j_border[:, 8:9], lambda x, d: (*x[:2], x[2] + d * np.eye(8)[3]), 1e-5)
-    check(j_border[:, 9:10], lambda x, d: (*x[:2], x[2] + d * np.eye(8)[7]))
+    # Distance, index of the water, thickness, index of the glass.
+    for column, entry, step in (
+        (8, 3, 1e-5),
+        (9, 7, 1e-4),
+        (10, 4, 1e-5),
+        (11, 6, 1e-4),
+    ):
+        check(j_border[:, column : column + 1], _with_port(entry), step)
+    for slot in param_slots(camera.model_name):
+        column = j_border[:, FIRST_LENS + slot]
+        if slot == 0 and 1 not in param_slots(camera.model_name):
+            column = column + j_border[:, FIRST_LENS + 1]
+        check(column[:, None], _with_lens(camera.model_name, slot))
+
+
+def _with_port(entry):
+    return lambda x, delta: (*x[:2], x[2] + delta * np.eye(8)[entry], x[3])
+
+
+def _with_lens(model, slot):
+    """One parameter of a lens row; a single focal length is both."""
+    both = [0, 1] if slot == 0 and 1 not in param_slots(model) else [slot]
+
+    def plus(x, delta):
+        lens = x[3].copy()
+        lens[both] += delta
+        return *x[:3], lens
+
+    return plus
 
 
 def _with_rotation(x, delta):
     quat = rigid3.multiply_quats(rigid3.quat_from_rotvec(delta), x[1][:4])
-    return x[0], np.concatenate([quat, x[1][4:]]), x[2]
+    return x[0], np.concatenate([quat, x[1][4:]]), *x[2:]
 
 
 def _with_translation(x, delta):
     length = np.linalg.norm(x[1][4:])
     direction = unit_vector.plus(x[1][4:] / length, delta[:2])
     shift = (length + delta[2]) * direction
-    return x[0], np.concatenate([x[1][:4], shift]), x[2]
+    return x[0], np.concatenate([x[1][:4], shift]), *x[2:]
 
 
 def _with_normal(x, delta):
-    return *x[:2], np.concatenate([unit_vector.plus(x[2][:3], delta), x[2][3:]])
+    return *x[:2], np.concatenate([unit_vector.plus(x[2][:3], delta), x[2][3:]]), x[3]

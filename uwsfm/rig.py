@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
     import pycolmap
 
     from uwsfm.models.port import FlatPort
+    from uwsfm.models.radial_undistortion import LensConversion
     from uwsfm.models.refractive import RefractiveCamera
 
 UNIT_TOLERANCE = 1e-9
@@ -44,6 +45,10 @@ class RigCamera:
     valid_radius_px: float | None = None
     """How far from the principal point the calibration in air reached; features beyond
     it do not take part. None: the whole image."""
+    conversion_max_px: float | None = None
+    """Greatest error of ``camera`` as a stand-in for a lens that COLMAP has no model
+    of. None: nothing was converted."""
+    conversion_rms_px: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,14 +240,7 @@ def camera_from_opencv(
         InputError: not a camera matrix, skew, a wrong number of distortion values, or
             as `camera_from_colmap`.
     """
-    (fx, skew, cx), (zero, fy, cy), last = np.asarray(camera_matrix, float).tolist()
-    if skew != 0:
-        raise InputError(
-            f"camera_matrix has a skew of {skew:g}, which COLMAP's lens models lack; "
-            "calibrate without skew"
-        )
-    if zero != 0 or last != [0, 0, 1]:
-        raise InputError("camera_matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    pinhole = _pinhole_params(camera_matrix, pixel_origin)
     allowed = (4,) if fisheye else (0, 4, 5, 8)
     values = np.ravel(distortion).tolist()
     if len(values) not in allowed:
@@ -258,9 +256,49 @@ def camera_from_opencv(
         model, values = "FULL_OPENCV", [*values, 0.0, 0.0, 0.0][:8]
     else:
         model, values = "OPENCV", values[:4]
+    return camera_from_colmap(model, width, height, [*pinhole, *values])
+
+
+def camera_from_radial_undistortion(
+    width: int,
+    height: int,
+    camera_matrix: ArrayLike,
+    undistortion: Sequence[float],
+    *,
+    pixel_origin: Literal["opencv", "colmap"],
+) -> tuple[pycolmap.Camera, LensConversion]:
+    """Intrinsics in air from a polynomial that undistorts, and the conversion's error.
+
+    Args:
+        width: Of the image, pixels.
+        height: Of the image, pixels.
+        camera_matrix: (3, 3), pixels.
+        undistortion: 1 to 3 values, see `uwsfm.models.radial_undistortion`.
+        pixel_origin: As of `camera_from_opencv`.
+
+    Raises:
+        InputError: not a camera matrix, skew, or as the functions used here.
+    """
+    from uwsfm.models.radial_undistortion import convert_radial_undistortion
+
+    pinhole = _pinhole_params(camera_matrix, pixel_origin)
+    camera_from_colmap("PINHOLE", width, height, pinhole)  # refuses implausible ones
+    found = convert_radial_undistortion(width, height, pinhole, undistortion)
+    return camera_from_colmap(found.model, width, height, found.params), found
+
+
+def _pinhole_params(camera_matrix: ArrayLike, pixel_origin: str) -> list[float]:
+    """fx, fy, cx, cy with COLMAP's pixel origin."""
+    (fx, skew, cx), (zero, fy, cy), last = np.asarray(camera_matrix, float).tolist()
+    if skew != 0:
+        raise InputError(
+            f"camera_matrix has a skew of {skew:g}, which COLMAP's lens models lack; "
+            "calibrate without skew"
+        )
+    if zero != 0 or last != [0, 0, 1]:
+        raise InputError("camera_matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     shift = 0.5 if pixel_origin == "opencv" else 0.0  # OpenCV -> COLMAP pixel origin
-    params = [fx, fy, cx + shift, cy + shift, *values]
-    return camera_from_colmap(model, width, height, params)
+    return [fx, fy, cx + shift, cy + shift]
 
 
 # ---- What the numbers of a rig may be: each returns its value or raises InputError ---

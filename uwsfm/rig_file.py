@@ -30,7 +30,7 @@ from uwsfm.rig import (
     RigCamera,
     checked_baseline,
 )
-from uwsfm.rig_schema import ENTRIES, CameraEntry, RigFile
+from uwsfm.rig_schema import ENTRIES, CameraEntry, RadialUndistortionLens, RigFile
 
 if TYPE_CHECKING:
     pass
@@ -119,18 +119,25 @@ def _to_rig(file: RigFile) -> Rig:
 
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
-    port = entry.port
+    port, lens = entry.port, entry.intrinsics
     x, y, z = port.normal
+    conversion = None
+    if isinstance(lens, RadialUndistortionLens):
+        camera, conversion = lens.converted()
+    else:
+        camera = lens.to_camera()
     return RigCamera(
         name=entry.name,
         images=entry.images,
-        camera=entry.intrinsics.to_camera(),
+        camera=camera,
         port=FlatPort(
             (x, y, z), port.distance_m, port.thickness_m, port.glass_index, n_water
         ),
         refine_normal="normal" in port.refine,
         refine_distance="distance" in port.refine,
-        valid_radius_px=entry.intrinsics.valid_radius_px,
+        valid_radius_px=lens.valid_radius_px,
+        conversion_max_px=conversion.max_px if conversion else None,
+        conversion_rms_px=conversion.rms_px if conversion else None,
     )
 
 
@@ -269,10 +276,21 @@ def dump_rig(
     }
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):
-        block = _commented(comments.get(camera.name, ())) + _yaml([_block(rig, i)])
+        lines = [*comments.get(camera.name, ()), *_conversion_lines(camera)]
+        block = _commented(lines) + _yaml([_block(rig, i)])
         text += textwrap.indent(block, "  ")
     with replaced_file(Path(path)) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def _conversion_lines(camera: RigCamera) -> list[str]:
+    """A comment on a lens that is written in another convention than it was given."""
+    if camera.conversion_max_px is None:
+        return []
+    return [
+        "lens: converted from a radial undistortion, off by at most "
+        f"{camera.conversion_max_px:.2g} px (RMS {camera.conversion_rms_px:.2g} px)"
+    ]
 
 
 def _block(rig: Rig, i: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from uwsfm.geometry.rigid3 import Array, from_rotmat
 from uwsfm.rig import (
     camera_from_colmap,
     camera_from_opencv,
+    camera_from_radial_undistortion,
     checked_baseline,
     checked_folder,
     checked_index,
@@ -33,6 +35,8 @@ from uwsfm.rig import (
 
 if TYPE_CHECKING:
     import pycolmap
+
+    from uwsfm.models.radial_undistortion import LensConversion
 
 _Pixels = Annotated[int, Field(ge=1, le=100_000)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -96,6 +100,27 @@ class OpenCvLens(Entry):
         return camera_from_opencv(*size, **block)
 
 
+class RadialUndistortionBlock(Entry):
+    width_px: _Pixels
+    height_px: _Pixels
+    camera_matrix: _Matrix
+    undistortion: _Numbers
+    pixel_origin: Literal["opencv", "colmap"]
+
+
+class RadialUndistortionLens(Entry):
+    radial_undistortion: RadialUndistortionBlock
+    valid_radius_px: _Radius | None = None
+
+    def to_camera(self) -> pycolmap.Camera:
+        return self.converted()[0]
+
+    def converted(self) -> tuple[pycolmap.Camera, LensConversion]:
+        block = self.radial_undistortion.model_dump()
+        size = block.pop("width_px"), block.pop("height_px")
+        return camera_from_radial_undistortion(*size, **block)
+
+
 class CamFromRig(Entry):
     rotation_xyzw: _Quaternion | None = None
     rotation_matrix: Annotated[_Matrix, AfterValidator(checked_rotation)] | None = None
@@ -114,25 +139,39 @@ class CamFromRig(Entry):
         return np.array([*(self.rotation_xyzw or ()), *self.translation_m])
 
 
+_LENS_BLOCKS = ("opencv", "radial_undistortion")
+
+
 def _lens_tag(value: Any) -> str:
-    # Tags show up in pydantic's key paths; the brackets mark them for removal.
-    return "(opencv)" if isinstance(value, dict) and "opencv" in value else "(colmap)"
+    keys = [str(key).lower() for key in value] if isinstance(value, dict) else []
+    for block in _LENS_BLOCKS:
+        # A misspelt block is still meant: its error should suggest the right name.
+        if difflib.get_close_matches(block, keys, n=1, cutoff=0.7):
+            # Tags show up in pydantic's key paths; the brackets mark them for removal.
+            return f"({block})"
+    return "(colmap)"
+
+
+_Lens = ColmapLens | OpenCvLens | RadialUndistortionLens
+_TaggedLens = Annotated[
+    Annotated[ColmapLens, Tag("(colmap)")]
+    | Annotated[OpenCvLens, Tag("(opencv)")]
+    | Annotated[RadialUndistortionLens, Tag("(radial_undistortion)")],
+    Discriminator(_lens_tag),
+]
 
 
 class CameraEntry(Entry):
     name: Annotated[str, AfterValidator(checked_text)]
     images: Annotated[str, AfterValidator(checked_folder)]
-    intrinsics: Annotated[
-        Annotated[ColmapLens, Tag("(colmap)")] | Annotated[OpenCvLens, Tag("(opencv)")],
-        Discriminator(_lens_tag),
-    ]
+    intrinsics: _TaggedLens
     port: PortEntry
     cam_from_rig: CamFromRig | None = None
     baseline_m: Annotated[_Number, AfterValidator(checked_baseline)] | None = None
 
     @field_validator("intrinsics")
     @classmethod
-    def _is_plausible(cls, lens: ColmapLens | OpenCvLens) -> Any:
+    def _is_plausible(cls, lens: _Lens) -> Any:
         lens.to_camera()
         return lens
 
@@ -152,6 +191,8 @@ ENTRIES: dict[str, type[Entry]] = {
     "(colmap)": ColmapLens,
     "(opencv)": OpenCvLens,
     "opencv": OpenCvBlock,
+    "(radial_undistortion)": RadialUndistortionLens,
+    "radial_undistortion": RadialUndistortionBlock,
     "port": PortEntry,
     "cam_from_rig": CamFromRig,
 }

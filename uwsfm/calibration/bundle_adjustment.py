@@ -2,8 +2,8 @@
 
 Rig poses, cam_from_rig, port normals and distances and the points move together on the
 reprojection error in true pixels. Staging (normals first, then distances) converges
-less often, and the nested scheme of Sedlazeck & Koch (BMVC 2011, fig. 5) reaches the
-same optimum a hundred times slower.
+less often, and the nested scheme of Sedlazeck & Koch (BMVC 2011, fig. 5), which is
+`strategies.minimize_nested`, reaches the same optimum a hundred times slower.
 """
 
 import time
@@ -12,24 +12,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import (
     CalibrateOptions,
     CalibrateSummary,
     CalibrationResult,
     Covariance,
 )
+from uwsfm.calibration.strategies import STRATEGIES
 from uwsfm.calibration.uncertainty import Optimum, posterior_covariance
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver.layout import HELD, Layout, build_layout
+from uwsfm.solver.layout import Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import (
-    LengthPriors,
     LevenbergMarquardtOptions,
     LevenbergMarquardtResult,
+    Priors,
     Report,
     Stop,
-    minimize,
 )
 from uwsfm.solver.state import State
 
@@ -134,6 +135,19 @@ class _Solved:
         return float(np.sqrt(median / MEDIAN_CHI2_2 / share))
 
 
+def in_shared_cells(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (N,) of points that two or more cameras of one frame observe.
+
+    Args:
+        keep: (N,) observations that count.
+    """
+    cell = scene.point_idx * scene.num_frames + scene.frame_idx
+    _, index, counts = np.unique(cell[keep], return_inverse=True, return_counts=True)
+    shared = np.zeros(len(keep), dtype=bool)
+    shared[keep] = counts[index] >= 2
+    return shared
+
+
 class _Run:
     """The scene and settings that the solves of one calibration share."""
 
@@ -148,7 +162,8 @@ class _Run:
 
     @property
     def columns(self) -> IndexArray:
-        return self.settings.border_columns(self.at_zero)
+        models = [camera.camera.model_name for camera in self.scene.cameras]
+        return self.settings.border_columns(models, self.at_zero)
 
     def solve(
         self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float = 1.0
@@ -173,11 +188,14 @@ class _Run:
     def _solve_free(
         self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float
     ) -> _Solved:
+        if self.settings.error_name == "point_3d":
+            keep = keep & in_shared_cells(self.scene, keep)
         counts = np.bincount(self.scene.point_idx[keep], minlength=len(start.points))
         inliers = keep & (counts[self.scene.point_idx] >= 2)
         part, used = self.scene.select(inliers)
         layout = build_layout(part, self.columns)
         options = LevenbergMarquardtOptions(
+            error=self.settings.error_name,
             loss=loss,
             loss_scale_px=self.settings.loss_scale_px,
             max_iterations=self.settings.max_iterations,
@@ -187,7 +205,8 @@ class _Run:
         )
         priors = self.priors(sigma_px)
         part_state = replace(start, points=start.points[used])
-        result = minimize(layout, part_state, options, priors, self.report)
+        strategy = STRATEGIES[self.settings.strategy]
+        result = strategy(layout, part_state, options, priors, self.report)
         self.num_iterations += result.num_iterations
         points = np.full_like(self.scene.points, np.nan)
         points[used] = result.state.points
@@ -206,19 +225,8 @@ class _Run:
         residuals = state.to_scene(self.scene).residuals()
         return np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
 
-    def priors(self, sigma_px: float) -> LengthPriors:
-        """Priors on the baselines, weighed against observations of this noise."""
-        cols = self.columns[:, 5]
-        cameras = np.nonzero(cols != HELD)[0]
-        lengths = np.linalg.norm(self.scene.cam_from_rig[cameras, 4:], axis=1)
-        stddev = self.settings.baseline_stddev_m
-        weight = (sigma_px / stddev) ** 2 if len(cameras) else 0.0
-        return LengthPriors(
-            cols=cols[cameras],
-            cameras=cameras,
-            lengths=lengths,
-            weights=np.full(len(cameras), weight),
-        )
+    def priors(self, sigma_px: float) -> Priors | None:
+        return border_priors(self.scene, self.settings, self.columns, sigma_px)
 
 
 def _check_normals(state: State) -> None:

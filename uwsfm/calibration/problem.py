@@ -1,5 +1,6 @@
 """What a calibration is asked to do, and what it reports."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,11 +8,26 @@ from numpy.typing import NDArray
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens import NUM_PARAMS, param_slots
+from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver.error_models import ERROR_CODES
 from uwsfm.solver.layout import HELD
 from uwsfm.solver.losses import LOSS_CODES
 
 PerCamera = bool | tuple[bool, ...]
+
+DEFAULT_ERRORS = {"joint": "reprojection", "nested": "virtual_camera"}
+"""Strategies, and what they minimise (nested: in its outer loop) unless told."""
+
+PRIORS = (
+    "distance_stddev_m",
+    "normal_stddev_deg",
+    "water_index_stddev",
+    "focal_stddev",
+    "principal_point_stddev_px",
+    "distortion_stddev",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,50 +45,122 @@ class CalibrateOptions:
     """Of each of the two solves; 5-8 are usual."""
     initial_damping: float = 1e-4
     """1e-2 if the normals may be more than 30 degrees off."""
+    strategy: str = "joint"
+    """"joint": everything moves together; "nested": the loops of the paper's fig. 5,
+    which reach the same optimum a hundred times slower."""
+    error: str | None = None
+    """What is minimised: "reprojection" (pixels), "virtual_camera" or
+    "virtual_camera_tangential" (metres on the port; the paper's eq. 6-10, centred on
+    the axis or on the other sheet of the caustic), "point_3d" (metres in space). None:
+    the strategy's own, reprojection if joint, virtual_camera in the outer loop if
+    nested."""
     refine_normals: PerCamera = True
     refine_distances: PerCamera = True
     refine_cam_from_rig: bool = True
     """Rotations and the directions of the translations."""
     refine_water_index: bool = False
     """One index shared by all ports."""
+    refine_focal: bool = False
+    """Focal lengths of every camera; they trade against water index and distance."""
+    refine_principal_point: bool = False
+    """Trades against the normal."""
+    refine_distortion: bool = False
+    """All distortion parameters that the camera's model has."""
     baseline_stddev_m: float = 0.0
     """Standard deviation of every baseline length; 0 holds the lengths. They are the
     only source of scale: without them no length is determined."""
+    distance_stddev_m: float | None = None
+    """How well the port distances of the start are known; None: not at all. So for all
+    that follow; they matter for what is refined only."""
+    normal_stddev_deg: float | None = None
+    """Root mean square angle."""
+    water_index_stddev: float | None = None
+    focal_stddev: float | None = None
+    """Relative: 1e-3 is 0.1 %."""
+    principal_point_stddev_px: float | None = None
+    """Per coordinate."""
+    distortion_stddev: float | None = None
+    """Of each distortion parameter."""
 
     def __post_init__(self) -> None:
-        if self.loss not in LOSS_CODES:
-            raise InputError(
-                f"loss must be one of {', '.join(LOSS_CODES)}, got {self.loss!r}"
-            )
+        _one_of("loss", self.loss, LOSS_CODES)
+        _one_of("strategy", self.strategy, DEFAULT_ERRORS)
+        _one_of("error", self.error_name, ERROR_CODES)
         for name in ("loss_scale_px", "prune_sigma", "initial_damping"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in PRIORS:
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < np.inf:
+                raise InputError(f"{name} must be positive, got {value}")
         if self.max_iterations < 1:
             raise InputError(f"max_iterations must be >= 1, got {self.max_iterations}")
         if not 0.0 <= self.baseline_stddev_m < np.inf:
             raise InputError(
                 f"baseline_stddev_m must be >= 0, got {self.baseline_stddev_m}"
             )
+        self._check_error()
 
-    def border_columns(self, at_zero: NDArray[np.bool_]) -> IndexArray:
+    def _check_error(self) -> None:
+        """Refuse what another error than reprojection does not determine."""
+        if self.error_name == "reprojection":
+            return
+        for name in ("refine_focal", "refine_principal_point", "refine_distortion"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name} needs the reprojection error: in {self.error_name} the "
+                    "pixels' rays in air are given"
+                )
+        if self.strategy == "joint" and np.any(self.refine_distances):
+            raise InputError(
+                f"error {self.error_name!r} is measured in metres, which a port "
+                "distance shrinks: give refine_distances=False, or strategy='nested'"
+            )
+
+    @property
+    def error_name(self) -> str:
+        """What is minimised; if nested, in the outer loop."""
+        return self.error or DEFAULT_ERRORS[self.strategy]
+
+    def border_columns(
+        self, models: Sequence[str], at_zero: NDArray[np.bool_]
+    ) -> IndexArray:
         """(C, BORDER_SIZE) columns of what is refined, HELD for the rest.
 
         Args:
+            models: COLMAP names of the C lenses.
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
-        num_cameras = len(at_zero)
-        normals = _per_camera("refine_normals", self.refine_normals, num_cameras)
-        distances = _per_camera("refine_distances", self.refine_distances, num_cameras)
-        free = np.zeros((num_cameras, 9), dtype=bool)
-        free[1:, :5] = self.refine_cam_from_rig
-        free[1:, 5] = self.baseline_stddev_m > 0.0
-        free[:, 6:8] = normals[:, None]
-        free[:, 8] = distances & ~at_zero
-        columns = np.full((num_cameras, 10), HELD, dtype=np.int64)
-        columns[:, :9][free] = np.arange(np.count_nonzero(free))
-        if self.refine_water_index:
-            columns[:, 9] = np.count_nonzero(free)
+        count = len(at_zero)
+        normals = _per_camera("refine_normals", self.refine_normals, count)
+        distances = _per_camera("refine_distances", self.refine_distances, count)
+        free = np.zeros((count, border.BORDER_SIZE), dtype=bool)
+        free[1:, border.ROTATION] = self.refine_cam_from_rig
+        free[1:, border.DIRECTION] = self.refine_cam_from_rig
+        free[1:, border.LENGTH] = self.baseline_stddev_m > 0.0
+        free[:, border.NORMAL] = normals[:, None]
+        free[:, border.DISTANCE] = distances & ~at_zero
+        wanted = np.zeros(NUM_PARAMS, dtype=bool)
+        wanted[:2] = self.refine_focal
+        wanted[2:4] = self.refine_principal_point
+        wanted[4:] = self.refine_distortion
+        for c, model in enumerate(models):
+            for slot in param_slots(model):
+                free[c, border.FIRST_LENS + slot] = wanted[slot]
+        free[0, border.WATER_INDEX] = self.refine_water_index
+        columns = np.full(free.shape, HELD, dtype=np.int64)
+        columns[free] = np.arange(np.count_nonzero(free))
+        columns[:, border.WATER_INDEX] = columns[0, border.WATER_INDEX]
+        for c, model in enumerate(models):
+            if 1 not in param_slots(model):  # one focal length for both axes
+                fx = columns[c, border.FIRST_LENS]
+                columns[c, border.FIRST_LENS + 1] = fx
         return columns
+
+
+def _one_of(name: str, value: str, allowed: Iterable[str]) -> None:
+    if value not in allowed:
+        raise InputError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
 
 
 def _per_camera(name: str, value: PerCamera, count: int) -> NDArray[np.bool_]:
@@ -110,15 +198,17 @@ class CameraCovariance:
 class Covariance:
     """Posterior covariance at the optimum, scaled by the noise found in the data.
 
-    Parameters of a camera, in the order of ``border_cols``: rotation of cam_from_rig
-    (3, left tangent, radians), direction of its translation (2, tangent), its length
-    (1, metres), port normal (2, tangent), port distance (1, metres), water index (1).
+    The parameters of a camera are those of `uwsfm.residuals.border`, in its order:
+    rotation of cam_from_rig (3, left tangent, radians), direction of its translation
+    (2, tangent), its length (metres), port normal (2, tangent), port distance (metres),
+    water index, glass thickness, glass index, and the lens. The covariance is that of
+    the maximum likelihood: another error than reprojection scatters at least so much.
     """
 
     border: Array
     """(B, B), marginal over poses and points, if every observation errs alone."""
     border_cols: IndexArray
-    """(C, 10) column of each parameter of each camera, -1 if held."""
+    """(C, BORDER_SIZE) column of each parameter of each camera, -1 if held."""
     frames: Array
     """(F, 6, 6) of rig_from_world [rotation, translation]; zero for the held first."""
     points: Array

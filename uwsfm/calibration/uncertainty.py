@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.problem import CameraCovariance, Covariance
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray
 from uwsfm.solver.clustered import clustered_covariance
 from uwsfm.solver.covariance import (
@@ -14,10 +15,11 @@ from uwsfm.solver.covariance import (
     point_covariances,
     reduced_covariance,
 )
-from uwsfm.solver.layout import Layout
+from uwsfm.solver.error_models import error_model
+from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.levenberg_marquardt import (
-    LengthPriors,
     LevenbergMarquardtOptions,
+    Priors,
     Problem,
 )
 from uwsfm.solver.normal_equations import NormalEquations
@@ -43,7 +45,7 @@ class Optimum:
     """(C, BORDER_SIZE)"""
     at_zero: NDArray[np.bool_]
     """(C,) distances held at their bound."""
-    priors: LengthPriors
+    priors: Priors | None
     sigma_px: float
     image_sizes: IndexArray
     """(C, 2) width, height."""
@@ -54,8 +56,7 @@ def posterior_covariance(optimum: Optimum) -> Covariance:
     """Covariances from the noise found, and standard deviations that neighbours' shared
     errors cannot beat."""
     layout = optimum.layout
-    options = LevenbergMarquardtOptions(loss="l2")
-    eqs = Problem(layout, options, optimum.priors).linearize(optimum.state)
+    eqs = likelihood(layout, optimum.state, optimum.priors)
     reduced = reduced_covariance(layout, eqs)
     variance = optimum.sigma_px**2
     border = variance * reduced.border(layout)
@@ -80,6 +81,13 @@ def posterior_covariance(optimum: Optimum) -> Covariance:
     )
 
 
+def likelihood(layout: Layout, state: State, priors: Priors | None) -> NormalEquations:
+    """Normal equations of the reprojection error and the priors, squared loss."""
+    options = LevenbergMarquardtOptions(loss="l2")
+    error = error_model(options.error, layout, state)
+    return Problem(layout, error, options, priors).linearize(state)
+
+
 def _shared_errors(
     optimum: Optimum, eqs: NormalEquations, reduced: ReducedCovariance
 ) -> Array:
@@ -91,9 +99,12 @@ def _shared_errors(
     )
     # Residuals are smaller than errors by the share of fitted parameters.
     covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
-    priors = reduced.matrix[:, offset + optimum.priors.cols]
-    covariance += optimum.sigma_px**2 * (priors * optimum.priors.weights) @ priors.T
-    return covariance[offset:, offset:]
+    if optimum.priors is not None:
+        weights = optimum.priors.weights
+        known = (weights > 0.0) & (layout.border_col != HELD)
+        reach = reduced.matrix[offset:, offset + layout.border_col[known]]
+        covariance += optimum.sigma_px**2 * (reach * weights[known]) @ reach.T
+    return covariance
 
 
 def _clusters(optimum: Optimum) -> IndexArray:
@@ -117,8 +128,11 @@ def camera_variances(border: Array, cols: IndexArray, cam_from_rig: Array) -> Ar
     block = padded[np.ix_(cols, cols)]
     arm = translation_arm(cam_from_rig[4:]).reshape(3, 3)
     translation = np.einsum("ka,kl,la->a", arm, block[3:6, 3:6], arm)
-    rotation, normal = np.trace(block[:3, :3]), np.trace(block[6:8, 6:8])
-    return np.array([normal, block[8, 8], rotation, *translation])
+    rotation, normal = (
+        np.trace(block[part, part]) for part in (border_of.ROTATION, border_of.NORMAL)
+    )
+    distance = block[border_of.DISTANCE, border_of.DISTANCE]
+    return np.array([normal, distance, rotation, *translation])
 
 
 def _camera_covariance(variances: Array, at_zero: bool) -> CameraCovariance:

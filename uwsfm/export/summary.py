@@ -37,6 +37,8 @@ def housing_summary(model: Model, calibration: CalibrationResult) -> list[dict]:
         entries.append(
             {
                 "name": camera.name,
+                "lens_conversion_max_px": camera.conversion_max_px,
+                "lens_conversion_rms_px": camera.conversion_rms_px,
                 "normal": list(port.normal),
                 "normal_stddev_deg": _stddev(
                     cov.normal_stddev_deg, camera.refine_normal

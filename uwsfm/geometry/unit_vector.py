@@ -47,6 +47,16 @@ def plus(direction: ArrayLike, delta: ArrayLike) -> Array:
     return moved / np.linalg.norm(moved)
 
 
+def minus(target: ArrayLike, direction: ArrayLike) -> Array:
+    """The step (2,) in the tangent plane of ``direction`` that `plus` takes to
+    ``target`` (both (3,), unit)."""
+    direction = np.asarray(direction, dtype=np.float64)
+    across = tangent_basis(direction).T @ np.asarray(target, dtype=np.float64)
+    sine = float(np.linalg.norm(across))
+    angle = angle_between(target, direction)
+    return across * (angle / sine if sine > 0.0 else 1.0)
+
+
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
     """Angle between two vectors (3,), radians, accurate at small angles."""
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)

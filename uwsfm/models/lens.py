@@ -21,6 +21,7 @@ from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
 LENS_SIZE = 14
+NUM_PARAMS = 12
 PINHOLE, BROWN, FISHEYE = 0, 1, 2
 
 # Where each COLMAP model keeps its parameters in the common row.
@@ -34,6 +35,11 @@ _SLOTS: dict[str, tuple[int, ...]] = {
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 8, 9),
 }
 SUPPORTED_MODELS = tuple(_SLOTS)
+
+
+def param_slots(model: str) -> tuple[int, ...]:
+    """Where the parameters of a COLMAP model are in its lens row; fx may be fy too."""
+    return _SLOTS[model]
 
 
 def lens_row(model: str, params: Sequence[float] | Array) -> Array:
@@ -60,11 +66,17 @@ def lens_row(model: str, params: Sequence[float] | Array) -> Array:
         row[1] = row[0]
     if row[0] <= 0.0 or row[1] <= 0.0:
         raise InputError(f"camera model {model}: the focal length must be positive")
-    if model == "OPENCV_FISHEYE":
-        row[12] = FISHEYE
+    row[12] = FISHEYE if model == "OPENCV_FISHEYE" else BROWN
+    return with_limit(row)
+
+
+def with_limit(row: Array) -> Array:
+    """A lens row with ``kind`` and ``limit`` as its parameters demand."""
+    row = row.copy()
+    if row[12] == FISHEYE:
         row[13] = _fisheye_limit(row)
     else:
-        row[12] = BROWN if np.any(row[4:12] != 0.0) else PINHOLE
+        row[12] = BROWN if np.any(row[4:NUM_PARAMS] != 0.0) else PINHOLE
         row[13] = _brown_limit(row)
     return row
 
@@ -162,6 +174,40 @@ def _distort_fisheye(u, v, lens):
         xv,
         scale + v * v * scale_r,
     )
+
+
+@kernel
+def jac_by_params(u, v, lens, jac):
+    """d(pixel) / d(fx, fy, cx, cy, k1, k2, p1, p2, k3 .. k6), (2, 12), written.
+
+    Args:
+        u, v: x / z and y / z of a direction within the range of the lens.
+    """
+    ud, vd, _, _, _, _ = distort(u, v, lens)
+    fx, fy = lens[0], lens[1]
+    jac[0, 0], jac[1, 0], jac[0, 1], jac[1, 1] = ud, 0.0, 0.0, vd
+    jac[0, 2], jac[1, 2], jac[0, 3], jac[1, 3] = 1.0, 0.0, 0.0, 1.0
+    s = u * u + v * v
+    if lens[12] == 2.0:
+        radius = math.sqrt(s)
+        theta = math.atan(radius)
+        power = 1.0 if radius < 1e-8 else theta / radius
+        s = theta * theta
+        for k in range(4, 12):
+            jac[0, k], jac[1, k] = 0.0, 0.0
+        for k in (4, 5, 8, 9):
+            power *= s
+            jac[0, k], jac[1, k] = fx * u * power, fy * v * power
+        return
+    den = 1.0 + s * (lens[9] + s * (lens[10] + s * lens[11]))
+    radial = (1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))) / den
+    power = s / den
+    for k, m in ((4, 9), (5, 10), (8, 11)):
+        jac[0, k], jac[1, k] = fx * u * power, fy * v * power
+        jac[0, m], jac[1, m] = -fx * u * power * radial, -fy * v * power * radial
+        power *= s
+    jac[0, 6], jac[1, 6] = fx * 2.0 * u * v, fy * (s + 2.0 * v * v)
+    jac[0, 7], jac[1, 7] = fx * (s + 2.0 * u * u), fy * 2.0 * u * v
 
 
 @kernel

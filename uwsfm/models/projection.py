@@ -10,7 +10,7 @@ import math
 from uwsfm._jit import kernel
 from uwsfm.geometry.refraction import refract, slope, solve_flat_port
 from uwsfm.geometry.unit_vector import tangents
-from uwsfm.models.lens import dir_from_img, img_from_dir
+from uwsfm.models.lens import dir_from_img, img_from_dir, jac_by_params
 from uwsfm.models.status import (
     BEHIND_CAMERA,
     IN_AIR_GAP,
@@ -160,6 +160,14 @@ def project_with_jac(x, y, z, lens, port, jac):
         jac[i, 7] = scale * g * (1.0 + u) * g3 / n_air
         jac[i, 8] = scale * w * (1.0 + u) * w3 / n_air
     return VALID, px, py
+
+
+@kernel
+def lens_jac_of_point(x, y, z, lens, port, jac):
+    """d(pixel) / d(lens parameters) of a point that projects: jac (2, 12), written."""
+    _, q, _, rx, ry, rz, _ = _air_ray(x, y, z, port)
+    inv_z = 1.0 / (port[2] + q * rz)
+    jac_by_params((port[0] + q * rx) * inv_z, (port[1] + q * ry) * inv_z, lens, jac)
 
 
 @kernel

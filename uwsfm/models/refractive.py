@@ -1,6 +1,7 @@
 """`RefractiveCamera`: a lens in air behind a flat port in water."""
 
-from typing import Protocol
+import copy
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,7 +10,7 @@ from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models import projection
 from uwsfm.models.caustic import caustic_points
-from uwsfm.models.lens import SUPPORTED_MODELS, lens_row
+from uwsfm.models.lens import SUPPORTED_MODELS, lens_row, param_slots
 from uwsfm.models.port import FlatPort
 from uwsfm.models.status import VALID
 
@@ -23,11 +24,11 @@ class InAirCamera(Protocol):
     width: int
     height: int
 
-    @property
-    def model_name(self) -> str: ...
+    params: Any
+    """(K,) numbers."""
 
     @property
-    def params(self) -> Array: ...
+    def model_name(self) -> str: ...
 
     def cam_ray_from_img(self, image_points: Array) -> Array: ...
 
@@ -98,6 +99,14 @@ class RefractiveCamera:
     def with_port(self, port: FlatPort) -> "RefractiveCamera":
         """The same lens behind another port."""
         return RefractiveCamera(self._camera, port)
+
+    def with_lens(self, lens: Array) -> "RefractiveCamera":
+        """The same model and port with the parameters of a lens row."""
+        if np.array_equal(lens, self.lens):
+            return self
+        camera = copy.deepcopy(self._camera)
+        camera.params = lens[list(param_slots(self._camera.model_name))].tolist()
+        return RefractiveCamera(camera, self._port)
 
     def ray_from_img(self, xy: ArrayLike) -> tuple[Array, Array]:
         """Water rays of pixels (paper eq. 1-4).

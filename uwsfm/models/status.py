@@ -21,6 +21,8 @@ class Status(IntEnum):
     """The lens distortion is not invertible there, or the pixel is out of its range."""
     NOT_FINITE = 7
     """The input is NaN or infinite."""
+    NO_INTERSECTION = 8
+    """Fewer than two rays, or parallel ones: they fix no point."""
 
 
 # Plain integers for the kernels: numba compiles them as constants.
@@ -32,3 +34,4 @@ TOTAL_REFLECTION = int(Status.TOTAL_REFLECTION)
 MISSES_PORT = int(Status.MISSES_PORT)
 OUTSIDE_LENS = int(Status.OUTSIDE_LENS)
 NOT_FINITE = int(Status.NOT_FINITE)
+NO_INTERSECTION = int(Status.NO_INTERSECTION)

@@ -3,13 +3,9 @@
 import math
 
 from uwsfm._jit import kernel
-from uwsfm.models.projection import project, project_with_jac
+from uwsfm.models.projection import lens_jac_of_point, project, project_with_jac
 from uwsfm.models.status import VALID
-
-BORDER_SIZE = 10
-"""Parameters of one camera that all frames share, in this order:
-rotation of cam_from_rig (3), direction of its translation (2), its length (1),
-port normal (2), port distance (1), index of the water (1)."""
+from uwsfm.residuals.border import FIRST_LENS
 
 
 @kernel
@@ -32,7 +28,9 @@ def residual(x, y, z, xy, cam, lens, port):
 
 
 @kernel
-def residual_with_jac(x, y, z, xy, cam, arm, lens, port, j_port, j_rig, j_border):
+def residual_with_jac(
+    x, y, z, xy, cam, arm, lens, port, free_lens, j_port, j_rig, j_border
+):
     """Residual, with Jacobians by the point in the rig and by the camera.
 
     Args:
@@ -42,6 +40,7 @@ def residual_with_jac(x, y, z, xy, cam, arm, lens, port, j_port, j_rig, j_border
         arm: (9,) how its translation moves with direction (2) and length (1): three
             columns, one after the other.
         lens, port: rows of the models.
+        free_lens: whether the lens columns are wanted: they cost a second refraction.
         j_port: (2, 9) scratch.
         j_rig: (2, 3), written.
         j_border: (2, BORDER_SIZE), written.
@@ -52,11 +51,12 @@ def residual_with_jac(x, y, z, xy, cam, arm, lens, port, j_port, j_rig, j_border
     ax = cam[0] * x + cam[1] * y + cam[2] * z
     ay = cam[4] * x + cam[5] * y + cam[6] * z
     az = cam[8] * x + cam[9] * y + cam[10] * z
-    status, u, v = project_with_jac(
-        ax + cam[3], ay + cam[7], az + cam[11], lens, port, j_port
-    )
+    px, py, pz = ax + cam[3], ay + cam[7], az + cam[11]
+    status, u, v = project_with_jac(px, py, pz, lens, port, j_port)
     if status != VALID:
         return status, math.nan, math.nan
+    if free_lens:
+        lens_jac_of_point(px, py, pz, lens, port, j_border[:, FIRST_LENS:])
     for i in range(2):
         lx, ly, lz = j_port[i, 0], j_port[i, 1], j_port[i, 2]
         for k in range(3):
@@ -72,4 +72,6 @@ def residual_with_jac(x, y, z, xy, cam, arm, lens, port, j_port, j_rig, j_border
         j_border[i, 7] = j_port[i, 4]
         j_border[i, 8] = j_port[i, 5]
         j_border[i, 9] = j_port[i, 8]
+        j_border[i, 10] = j_port[i, 6]
+        j_border[i, 11] = j_port[i, 7]
     return status, u - xy[0], v - xy[1]

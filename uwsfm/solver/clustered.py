@@ -15,26 +15,25 @@ import numpy as np
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.status import VALID
-from uwsfm.residuals.reprojection import BORDER_SIZE, point_in_rig
+from uwsfm.residuals.border import BORDER_SIZE
+from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.scene import IndexArray
+from uwsfm.solver.cells import linearized_residual
 from uwsfm.solver.covariance import ReducedCovariance
 from uwsfm.solver.layout import HELD, Layout
-from uwsfm.solver.normal_equations import (
-    KernelState,
-    NormalEquations,
-    linearized_residual,
-)
+from uwsfm.solver.normal_equations import NormalEquations
+from uwsfm.solver.state import KernelState
 
 
 @kernel
-def _add_score(layout, eqs, p, col, torque_force, pull, border, cols, offset, score):
+def _add_score(layout, eqs, p, col, torque_force, pull, border, camera, offset, score):
     """Add J~^T r of one observation: its own part, minus what its point takes up."""
     if col != HELD:
         for a in range(6):
             score[col + a] += torque_force[a]
-    for k in range(BORDER_SIZE):
-        if cols[k] != HELD:
-            score[offset + cols[k]] += border[k]
+    for s in range(layout.free_start[camera], layout.free_start[camera + 1]):
+        k = layout.free_slot[s]
+        score[offset + layout.border_col[camera, k]] += border[k]
     for c in range(layout.point_start[p], layout.point_start[p + 1]):
         other = layout.frame_col[layout.cell_frame[c]]
         if other == HELD:
@@ -53,7 +52,7 @@ def _add_score(layout, eqs, p, col, torque_force, pull, border, cols, offset, sc
 def _scores(layout, state, eqs, inverses, cluster, offset, out):
     """Sum J~^T r of each cluster into out (clusters, n); squared loss."""
     j_port, j_rig = np.empty((2, 9)), np.empty((2, 3))
-    j_border = np.empty((2, BORDER_SIZE))
+    j_border = np.zeros((2, BORDER_SIZE))
     force, grad = np.empty(6), np.empty(BORDER_SIZE)
     for p in range(len(layout.point_start) - 1):
         inverse = inverses[p]
@@ -85,7 +84,7 @@ def _scores(layout, state, eqs, inverses, cluster, offset, out):
                     force,
                     pull,
                     grad,
-                    layout.border_col[layout.camera[i]],
+                    layout.camera[i],
                     offset,
                     out[cluster[i]],
                 )
@@ -98,7 +97,7 @@ def clustered_covariance(
     reduced: ReducedCovariance,
     cluster: IndexArray,
 ) -> Array:
-    """Covariance (n, n) of frames and border, for errors shared within clusters.
+    """Covariance (B, B) of the border, for errors shared within clusters.
 
     Args:
         layout, state, eqs: the problem at its least-squares optimum.
@@ -108,5 +107,5 @@ def clustered_covariance(
     scores = np.zeros((int(cluster.max()) + 1, len(reduced.matrix)))
     offset = layout.num_frame_cols
     _scores(layout, state, eqs, reduced.inverses, cluster, offset, scores)
-    half = reduced.matrix @ scores.T
+    half = reduced.matrix[offset:] @ scores.T
     return half @ half.T

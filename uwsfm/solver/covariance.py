@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg import lapack
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
@@ -46,23 +46,40 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
 
     The observations' noise is taken as 1 px: multiply by the noise variance.
     """
-    lower, _, inverses = schur.reduced_system(layout, eqs, 0.0)
-    matrix = lower + np.tril(lower, -1).T
-    size = len(matrix)
+    matrix, _, inverses = schur.reduced_system(layout, eqs, 0.0)
+    inverse = _inverse_of_lower(matrix)
+    if inverse is None:
+        return ReducedCovariance(
+            matrix=np.full_like(matrix, np.nan), determined=False, inverses=inverses
+        )
+    return ReducedCovariance(matrix=inverse, determined=True, inverses=inverses)
+
+
+def _inverse_of_lower(matrix: Array) -> Array | None:
+    """Inverse of a symmetric matrix by Cholesky; None if it is singular.
+
+    Args:
+        matrix: (n, n), its lower triangle; lost.
+    """
+    if not len(matrix):
+        return matrix
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = (np.ones(0), np.zeros((0, 0)))
-    if size:
-        values, vectors = scipy.linalg.eigh(matrix * scale[:, None] * scale)
-    determined = bool(size == 0 or values[0] > SINGULAR)
-    inverse = np.full_like(matrix, np.nan)
-    if determined:
-        scaled = vectors * scale[:, None]
-        inverse = (scaled / values) @ scaled.T
-    return ReducedCovariance(
-        matrix=inverse,
-        determined=determined,
-        inverses=inverses,
-    )
+    matrix *= scale
+    matrix *= scale[:, None]
+    # Fortran reads rows as columns: our lower triangle is its upper one.
+    upper = matrix.T
+    factor, info = lapack.dpotrf(upper, lower=0, clean=1, overwrite_a=1)
+    if info != 0:
+        return None
+    # 1 / |A^-1|, which is at most the smallest eigenvalue.
+    if not lapack.dpocon(factor, 1.0)[0] > SINGULAR:
+        return None
+    inverse, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
+    lower = inverse.T
+    inverse = lower + np.tril(lower, -1).T
+    inverse *= scale
+    inverse *= scale[:, None]
+    return inverse
 
 
 @kernel

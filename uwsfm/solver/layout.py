@@ -10,6 +10,7 @@ import numpy as np
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.residuals.border import LENS
 from uwsfm.scene import IndexArray, Scene
 
 HELD = -1
@@ -34,6 +35,12 @@ class Layout(NamedTuple):
     """(C, BORDER_SIZE) column of each camera parameter in the border, or HELD."""
     order: IndexArray
     """(N,) index of each sorted observation in the scene."""
+    free_start: IndexArray
+    """(C + 1,) first of a camera's entries in ``free_slot``."""
+    free_slot: IndexArray
+    """Camera parameters that have a column, camera after camera."""
+    free_lens: bool
+    """Whether a lens parameter is among them."""
 
     @property
     def num_frame_cols(self) -> int:
@@ -65,13 +72,28 @@ def build_layout(scene: Scene, border_col: IndexArray) -> Layout:
     observed = np.unique(frame)
     frame_col = np.full(scene.num_frames, HELD, dtype=np.int64)
     frame_col[observed[1:]] = 6 * np.arange(len(observed) - 1)
-    return Layout(
+    layout = Layout(
         xy=np.ascontiguousarray(scene.xy[order]),
         camera=np.ascontiguousarray(scene.camera_idx[order]),
         cell_start=np.append(starts, len(order)).astype(np.int64),
         cell_frame=np.ascontiguousarray(frame[starts]),
         point_start=np.concatenate([[0], np.cumsum(cells_of_point)]).astype(np.int64),
         frame_col=frame_col,
-        border_col=np.ascontiguousarray(border_col, dtype=np.int64),
+        border_col=border_col,
         order=order.astype(np.int64),
+        free_start=np.empty(0, dtype=np.int64),
+        free_slot=np.empty(0, dtype=np.int64),
+        free_lens=False,
+    )
+    return with_columns(layout, border_col)
+
+
+def with_columns(layout: Layout, border_col: IndexArray) -> Layout:
+    """The same observations with other border columns (C, BORDER_SIZE)."""
+    free = border_col != HELD
+    return layout._replace(
+        border_col=np.ascontiguousarray(border_col, dtype=np.int64),
+        free_start=np.concatenate([[0], np.cumsum(free.sum(axis=1))]).astype(np.int64),
+        free_slot=np.nonzero(free)[1].astype(np.int64),
+        free_lens=bool(np.any(free[:, LENS])),
     )

@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_limits
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.scene import IndexArray
 from uwsfm.solver import schur
+from uwsfm.solver.error_models import ErrorModel, error_model
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.normal_equations import (
@@ -19,6 +19,7 @@ from uwsfm.solver.normal_equations import (
     NormalEquations,
     empty_normal_equations,
     linearize,
+    squared_errors,
     total_cost,
 )
 from uwsfm.solver.state import State
@@ -37,6 +38,8 @@ class Stop(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class LevenbergMarquardtOptions:
+    error: str = "reprojection"
+    """See `error_models.ERROR_CODES`."""
     loss: str = "l2"
     loss_scale_px: float = 3.0
     max_iterations: int = 50
@@ -46,34 +49,24 @@ class LevenbergMarquardtOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LengthPriors:
-    """Weak knowledge of the baseline lengths, as rows of the border."""
+class Priors:
+    """What is known of the border beforehand: its values, and how well."""
 
-    cols: IndexArray
-    """(L,) border columns of the lengths."""
-    cameras: IndexArray
-    """(L,) their cameras."""
-    lengths: Array
-    """(L,) metres"""
+    reference: State
     weights: Array
-    """(L,) (noise of an observation in px / standard deviation in metres) squared"""
+    """(C, BORDER_SIZE) (noise of an observation in px / standard deviation) squared;
+    zero where nothing is known. A parameter that cameras share has one weight."""
 
     def cost(self, state: State) -> float:
-        miss = state.baselines[self.cameras] - self.lengths
+        miss = state.border_difference(self.reference)
         return 0.5 * float(np.sum(self.weights * miss**2))
 
-    def add_to(self, eqs: NormalEquations, state: State) -> None:
-        miss = state.baselines[self.cameras] - self.lengths
-        eqs.border[self.cols, self.cols] += self.weights
-        eqs.border_grad[self.cols] += self.weights * miss
-
-
-NO_PRIORS = LengthPriors(
-    cols=np.zeros(0, dtype=np.int64),
-    cameras=np.zeros(0, dtype=np.int64),
-    lengths=np.zeros(0),
-    weights=np.zeros(0),
-)
+    def add_to(self, eqs: NormalEquations, state: State, layout: Layout) -> None:
+        miss = state.border_difference(self.reference)
+        known = (self.weights > 0.0) & (layout.border_col != HELD)
+        cols, weights = layout.border_col[known], self.weights[known]
+        eqs.border[cols, cols] += weights
+        eqs.border_grad[cols] += weights * miss[known]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,39 +75,57 @@ class LevenbergMarquardtResult:
     cost: float
     """0.5 sum rho, priors included, px^2."""
     squares: Array
-    """(N,) squared residuals in the layout's order, NaN where invalid."""
-    num_invalid: int
+    """(N,) squared reprojection errors in the layout's order, px^2, whatever error was
+    minimised; NaN where a point cannot be projected."""
     num_iterations: int
     """Accepted and rejected steps."""
     stop: Stop
+
+    @property
+    def num_invalid(self) -> int:
+        return int(np.count_nonzero(np.isnan(self.squares)))
 
 
 class Problem:
     """A layout with its loss and priors: cost, linearisation and damped steps."""
 
     def __init__(
-        self, layout: Layout, options: LevenbergMarquardtOptions, priors: LengthPriors
+        self,
+        layout: Layout,
+        error: ErrorModel,
+        options: LevenbergMarquardtOptions,
+        priors: Priors | None,
     ) -> None:
         self.layout = layout
+        self.error = error
         self.priors = priors
         self._loss = LOSS_CODES[options.loss]
         self._scale = options.loss_scale_px
         self._eqs = empty_normal_equations(layout)
 
-    def cost(self, state: State) -> tuple[float, int, Array]:
-        """Robust cost, number of invalid observations, squared residuals (N,)."""
-        squares = np.empty(len(self.layout.xy))
-        cost, invalid = total_cost(
-            self.layout, state.kernel_state(), self._loss, self._scale, squares
+    def cost(self, state: State) -> tuple[float, int]:
+        """Robust cost, priors included, and the number of valid errors."""
+        cost, valid = total_cost(
+            self.layout, state.kernel_state(), self.error, self._loss, self._scale
         )
-        return cost + self.priors.cost(state), invalid, squares
+        if self.priors is not None:
+            cost += self.priors.cost(state)
+        return cost, valid
 
     def linearize(self, state: State) -> NormalEquations:
         """Normal equations at a state; the arrays are used again by the next call."""
         for block in self._eqs:
             block[...] = 0.0
-        linearize(self.layout, state.kernel_state(), self._loss, self._scale, self._eqs)
-        self.priors.add_to(self._eqs, state)
+        linearize(
+            self.layout,
+            state.kernel_state(),
+            self.error,
+            self._loss,
+            self._scale,
+            self._eqs,
+        )
+        if self.priors is not None:
+            self.priors.add_to(self._eqs, state, self.layout)
         return self._eqs
 
     def step(self, eqs: NormalEquations, damping: float) -> tuple[Array, Array] | None:
@@ -162,10 +173,10 @@ def minimize(
     layout: Layout,
     start: State,
     options: LevenbergMarquardtOptions,
-    priors: LengthPriors = NO_PRIORS,
+    priors: Priors | None = None,
     report: Report | None = None,
 ) -> LevenbergMarquardtResult:
-    """Minimise the robust reprojection error from a start.
+    """Minimise a robust error from a start.
 
     Marquardt scaling by max(diagonal, 1e-6); the damping falls by
     max(1/10, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure.
@@ -176,7 +187,9 @@ def minimize(
     size = layout.num_frame_cols + layout.num_border_cols
     limit = 1 if size < SINGLE_BLAS_BELOW else None
     with threadpool_limits(limit, user_api="blas"):
-        return _iterate(Problem(layout, options, priors), start, options, report)
+        error = error_model(options.error, layout, start)
+        problem = Problem(layout, error, options, priors)
+        return _iterate(problem, start, options, report)
 
 
 def _iterate(
@@ -185,15 +198,15 @@ def _iterate(
     options: LevenbergMarquardtOptions,
     report: Report | None,
 ) -> LevenbergMarquardtResult:
-    cost, invalid, squares = problem.cost(state)
-    if invalid == len(squares):
+    cost, valid = problem.cost(state)
+    if valid == 0:
         raise UwsfmError(
             "no observation can be projected from the start values: check the signs of "
             "cam_from_rig and of the poses"
         )
     damping, growth = options.initial_damping, 2.0
     # Below this all residuals are rounding errors (about 1e-11 px each).
-    floor = 1e-22 * len(squares)
+    floor = 1e-22 * len(problem.layout.xy)
     eqs = problem.linearize(state)
     stop, iterations = Stop.MAX_ITERATIONS, 0
     for iterations in range(1, options.max_iterations + 1):
@@ -204,15 +217,14 @@ def _iterate(
         decrease, predicted = -1.0, 1.0
         if steps is not None:
             trial = state.moved(problem.layout, *steps)
-            trial_cost, trial_invalid, trial_squares = problem.cost(trial)
+            trial_cost, _ = problem.cost(trial)
             decrease = cost - trial_cost
             predicted = problem.predicted_decrease(eqs, damping, *steps)
         if report is not None:
             report(iterations, min(cost, cost - decrease))
         if decrease > 0.0:
             relative, gain = decrease / cost, decrease / max(predicted, 1e-300)
-            state, cost, invalid = trial, trial_cost, trial_invalid
-            squares = trial_squares
+            state, cost = trial, trial_cost
             damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
             growth = 2.0
             if relative < options.min_relative_decrease:
@@ -227,11 +239,12 @@ def _iterate(
         if damping > 1e12:
             stop = Stop.STALLED
             break
+    squares = np.empty(len(problem.layout.xy))
+    squared_errors(problem.layout, state.kernel_state(), squares)
     return LevenbergMarquardtResult(
         state=state,
         cost=cost,
         squares=squares,
-        num_invalid=invalid,
         num_iterations=iterations,
         stop=stop,
     )

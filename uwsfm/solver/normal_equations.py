@@ -6,44 +6,27 @@ the rig, the pose enters by M = [-[q]x, I] and the point by the frame's rotation
 
     U += M^T H M,   W = M^T H R,   V += R^T H R
 
-The reduced system is dense: all frames, then the border (rig, ports, index).
+The reduced system is dense: all frames, then the border (rig, ports, lenses).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.status import VALID
-from uwsfm.residuals.reprojection import (
-    BORDER_SIZE,
-    point_in_rig,
-    residual,
-    residual_with_jac,
+from uwsfm.residuals.border import BORDER_SIZE
+from uwsfm.residuals.reprojection import point_in_rig, residual
+from uwsfm.solver.cells import (
+    add_point_3d,
+    add_reprojection,
+    add_virtual_camera,
+    cell_cost,
 )
-from uwsfm.solver.layout import HELD, Layout
-from uwsfm.solver.losses import INVALID_PX, rho
+from uwsfm.solver.error_models import POINT_3D, REPROJECTION
+from uwsfm.solver.layout import Layout
 
 MIN_DIAGONAL = 1e-6
-
-
-class KernelState(NamedTuple):
-    """The values of all parameters, as rows that kernels read."""
-
-    frames: Array
-    """(F, 12) rig_from_world as [R | t]."""
-    cams: Array
-    """(C, 12) cam_from_rig as [R | t]."""
-    arms: Array
-    """(C, 9) derivative of the translation by direction (2) and length (1)."""
-    lenses: Array
-    """(C, LENS_SIZE)"""
-    ports: Array
-    """(C, PORT_SIZE)"""
-    points: Array
-    """(P, 3)"""
 
 
 class NormalEquations(NamedTuple):
@@ -87,87 +70,6 @@ def empty_normal_equations(layout: Layout) -> NormalEquations:
 
 
 @kernel
-def total_cost(layout, state, loss, scale, squares):
-    """Robust cost 0.5 sum rho(|r|^2), and how many observations are invalid.
-
-    Args:
-        layout, state: the problem.
-        loss, scale: see `losses.rho`.
-        squares: (N,) written: squared residuals in sorted order, NaN if invalid.
-
-    Returns:
-        (cost, number of invalid observations).
-    """
-    cost, invalid = 0.0, 0
-    price, _ = rho(INVALID_PX * INVALID_PX, loss, scale)
-    for p in range(len(layout.point_start) - 1):
-        point = state.points[p]
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], point)
-            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-                cam = layout.camera[i]
-                status, rx, ry = residual(
-                    x,
-                    y,
-                    z,
-                    layout.xy[i],
-                    state.cams[cam],
-                    state.lenses[cam],
-                    state.ports[cam],
-                )
-                if status == VALID:
-                    squares[i] = rx * rx + ry * ry
-                    value, _ = rho(squares[i], loss, scale)
-                    cost += 0.5 * value
-                else:
-                    squares[i] = math.nan
-                    invalid += 1
-                    cost += 0.5 * price
-    return cost, invalid
-
-
-@kernel
-def linearized_residual(layout, state, i, x, y, z, j_port, j_rig, j_border):
-    """`residual_with_jac` of sorted observation i, at a point (x, y, z) in the rig."""
-    camera = layout.camera[i]
-    return residual_with_jac(
-        x,
-        y,
-        z,
-        layout.xy[i],
-        state.cams[camera],
-        state.arms[camera],
-        state.lenses[camera],
-        state.ports[camera],
-        j_port,
-        j_rig,
-        j_border,
-    )
-
-
-@kernel
-def _add_observation(j_rig, j_border, cols, rx, ry, weight, hess, grad, couple, out):
-    """Add one weighted observation to its cell's sums and to the border blocks."""
-    for a in range(3):
-        ja0, ja1 = weight * j_rig[0, a], weight * j_rig[1, a]
-        grad[a] += ja0 * rx + ja1 * ry
-        for b in range(3):
-            hess[a, b] += ja0 * j_rig[0, b] + ja1 * j_rig[1, b]
-        for k in range(BORDER_SIZE):
-            if cols[k] != HELD:
-                couple[a, cols[k]] += ja0 * j_border[0, k] + ja1 * j_border[1, k]
-    for k in range(BORDER_SIZE):
-        if cols[k] != HELD:
-            jk0, jk1 = weight * j_border[0, k], weight * j_border[1, k]
-            out.border_grad[cols[k]] += jk0 * rx + jk1 * ry
-            for m in range(BORDER_SIZE):
-                if cols[m] != HELD:
-                    out.border[cols[k], cols[m]] += (
-                        jk0 * j_border[0, m] + jk1 * j_border[1, m]
-                    )
-
-
-@kernel
 def _pose_times(x, y, z, mat, col):
     """M^T times a column of a (3, .) matrix: torque q x m, then m."""
     a, b, c = mat[0, col], mat[1, col], mat[2, col]
@@ -175,8 +77,9 @@ def _pose_times(x, y, z, mat, col):
 
 
 @kernel
-def _expand_cell(x, y, z, frame, p, c, f, hess, grad, couple, out):
+def _expand_cell(x, y, z, frame, p, c, f, work, out):
     """Expand a cell's sums to its frame, its point and their couplings."""
+    hess, grad, couple = work.hess, work.grad, work.couple
     pose_hess = np.empty((6, 3))  # M^T H
     for b in range(3):
         m0, m1, m2, m3, m4, m5 = _pose_times(x, y, z, hess, b)
@@ -223,28 +126,79 @@ def _expand_cell(x, y, z, frame, p, c, f, hess, grad, couple, out):
             )
 
 
+class Work(NamedTuple):
+    """Scratch of `linearize`: sums of a cell, Jacobians of an observation."""
+
+    hess: Array
+    grad: Array
+    couple: Array
+    j_port: Array
+    j_rig: Array
+    j_border: Array
+    j_cell: Array
+
+
 @kernel
-def linearize(layout, state, loss, scale, out):
+def _work(num_border, num_cameras):
+    return Work(
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty((3, num_border)),
+        np.empty((2, 9)),
+        np.zeros((4, 3)),  # a virtual camera's error has three rows and one of zeros
+        np.zeros((4, BORDER_SIZE)),
+        np.zeros((num_cameras, 3, BORDER_SIZE)),
+    )
+
+
+@kernel
+def linearize(layout, state, error, loss, scale, out):
     """Fill zeroed `NormalEquations` at a state, with weights rho'(s)."""
-    hess, grad = np.empty((3, 3)), np.empty(3)
-    couple = np.empty((3, len(out.border_grad)))
-    j_port, j_rig = np.empty((2, 9)), np.empty((2, 3))
-    j_border = np.empty((2, BORDER_SIZE))
+    work = _work(len(out.border_grad), len(state.cams))
     for p in range(len(layout.point_start) - 1):
-        point = state.points[p]
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             f = layout.cell_frame[c]
-            x, y, z = point_in_rig(state.frames[f], point)
-            hess[:], grad[:], couple[:] = 0.0, 0.0, 0.0
+            x, y, z = point_in_rig(state.frames[f], state.points[p])
+            work.hess[:], work.grad[:], work.couple[:] = 0.0, 0.0, 0.0
+            if error.code == REPROJECTION:
+                add_reprojection(layout, state, c, x, y, z, loss, scale, work, out)
+            elif error.code == POINT_3D:
+                add_point_3d(layout, state, error, c, x, y, z, loss, scale, work, out)
+            else:
+                add_virtual_camera(
+                    layout, state, error, c, x, y, z, loss, scale, work, out
+                )
+            _expand_cell(x, y, z, state.frames[f], p, c, f, work, out)
+
+
+@kernel
+def total_cost(layout, state, error, loss, scale):
+    """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
+    cost, valid = 0.0, 0
+    for p in range(len(layout.point_start) - 1):
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], state.points[p])
+            part, count = cell_cost(layout, state, error, c, x, y, z, loss, scale)
+            cost += part
+            valid += count
+    return cost, valid
+
+
+@kernel
+def squared_errors(layout, state, squares):
+    """Squared reprojection errors (N,) in sorted order, px^2; NaN where invalid."""
+    for p in range(len(layout.point_start) - 1):
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], state.points[p])
             for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
                 k = layout.camera[i]
-                status, rx, ry = linearized_residual(
-                    layout, state, i, x, y, z, j_port, j_rig, j_border
+                _, rx, ry = residual(
+                    x,
+                    y,
+                    z,
+                    layout.xy[i],
+                    state.cams[k],
+                    state.lenses[k],
+                    state.ports[k],
                 )
-                if status == VALID:
-                    _, weight = rho(rx * rx + ry * ry, loss, scale)
-                    cols = layout.border_col[k]
-                    _add_observation(
-                        j_rig, j_border, cols, rx, ry, weight, hess, grad, couple, out
-                    )
-            _expand_cell(x, y, z, state.frames[f], p, c, f, hess, grad, couple, out)
+                squares[i] = rx * rx + ry * ry

@@ -1,16 +1,42 @@
 """The values a bundle adjustment moves, and how a step moves them."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens import NUM_PARAMS, with_limit
 from uwsfm.models.port import FlatPort
-from uwsfm.residuals.reprojection import BORDER_SIZE
+from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout
-from uwsfm.solver.normal_equations import KernelState
+
+# Columns of a port's row that simply add.
+PORT_COLUMNS = {
+    border.DISTANCE: 3,
+    border.THICKNESS: 4,
+    border.GLASS_INDEX: 6,
+    border.WATER_INDEX: 7,
+}
+
+
+class KernelState(NamedTuple):
+    """The values of all parameters, as rows that kernels read."""
+
+    frames: Array
+    """(F, 12) rig_from_world as [R | t]."""
+    cams: Array
+    """(C, 12) cam_from_rig as [R | t]."""
+    arms: Array
+    """(C, 9) derivative of the translation by direction (2) and length (1)."""
+    lenses: Array
+    """(C, LENS_SIZE)"""
+    ports: Array
+    """(C, PORT_SIZE)"""
+    points: Array
+    """(P, 3)"""
 
 
 @dataclass(frozen=True)
@@ -43,8 +69,10 @@ class State:
             InputError: a port is not physical (a negative distance, say).
         """
         cameras = tuple(
-            camera.with_port(FlatPort.from_params(row))
-            for camera, row in zip(scene.cameras, self.ports, strict=True)
+            camera.with_port(FlatPort.from_params(port)).with_lens(lens)
+            for camera, port, lens in zip(
+                scene.cameras, self.ports, self.lenses, strict=True
+            )
         )
         return replace(
             scene,
@@ -75,19 +103,43 @@ class State:
         free = layout.frame_col != HELD
         offset = layout.num_frame_cols
         frames_step[free] = step[:offset].reshape(-1, 6)
+        deltas = spread_border(layout.border_col, step[offset:])
         cam_from_rig, ports = self.cam_from_rig.copy(), self.ports.copy()
-        for c, delta in enumerate(spread_border(layout.border_col, step[offset:])):
+        for c, delta in enumerate(deltas):
             cam_from_rig[c] = _moved_camera(cam_from_rig[c], delta)
-            ports[c, :3] = unit_vector.plus(ports[c, :3], delta[6:8])
-            ports[c, 3] += delta[8]
-            ports[c, 7] += delta[9]
+            ports[c, :3] = unit_vector.plus(ports[c, :3], delta[border.NORMAL])
+        for slot, column in PORT_COLUMNS.items():
+            ports[:, column] += deltas[:, slot]
+        lenses = self.lenses
+        if layout.free_lens:
+            lenses = lenses.copy()
+            lenses[:, :NUM_PARAMS] += deltas[:, border.LENS]
+            lenses = np.array([with_limit(row) for row in lenses])
         return replace(
             self,
             rig_from_world=rigid3.perturb(self.rig_from_world, frames_step),
             cam_from_rig=cam_from_rig,
             ports=ports,
             points=self.points + points_step,
+            lenses=lenses,
         )
+
+    def border_difference(self, reference: "State") -> Array:
+        """How far the border is from that of a reference, (C, BORDER_SIZE).
+
+        In the units of a step; rotations and directions of cam_from_rig are left zero.
+        """
+        difference = np.zeros((len(self.ports), border.BORDER_SIZE))
+        difference[:, border.LENGTH] = self.baselines - reference.baselines
+        for c, normal in enumerate(self.ports[:, :3]):
+            away = -unit_vector.minus(reference.ports[c, :3], normal)
+            difference[c, border.NORMAL] = away
+        for slot, column in PORT_COLUMNS.items():
+            difference[:, slot] = self.ports[:, column] - reference.ports[:, column]
+        difference[:, border.LENS] = (
+            self.lenses[:, :NUM_PARAMS] - reference.lenses[:, :NUM_PARAMS]
+        )
+        return difference
 
 
 def spread_border(border_col: IndexArray, step: Array) -> Array:
@@ -107,12 +159,12 @@ def translation_arm(translation: Array) -> Array:
 
 
 def _moved_camera(cam_from_rig: Array, delta: Array) -> Array:
-    """Turn the rotation by delta[:3], move the translation by delta[3:6]."""
-    assert delta.shape == (BORDER_SIZE,)
-    quat = rigid3.multiply_quats(rigid3.quat_from_rotvec(delta[:3]), cam_from_rig[:4])
+    """Turn the rotation, then turn and stretch the translation."""
+    turn = rigid3.quat_from_rotvec(delta[border.ROTATION])
+    quat = rigid3.multiply_quats(turn, cam_from_rig[:4])
     length = float(np.linalg.norm(cam_from_rig[4:]))
     translation = cam_from_rig[4:]
     if length > 0.0:
-        direction = unit_vector.plus(translation / length, delta[3:5])
-        translation = (length + delta[5]) * direction
+        direction = unit_vector.plus(translation / length, delta[border.DIRECTION])
+        translation = (length + delta[border.LENGTH]) * direction
     return np.concatenate([quat / np.linalg.norm(quat), translation])

@@ -1,0 +1,45 @@
+"""What the user knows beforehand, as rows of the border."""
+
+import numpy as np
+
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.residuals import border
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver.layout import HELD
+from uwsfm.solver.levenberg_marquardt import Priors
+from uwsfm.solver.state import State
+
+_FX, _FY, _CX, _CY = range(border.FIRST_LENS, border.FIRST_LENS + 4)
+_DISTORTION = slice(_CY + 1, border.BORDER_SIZE)
+
+
+def border_priors(
+    scene: Scene, settings: CalibrateOptions, columns: IndexArray, sigma_px: float
+) -> Priors | None:
+    """Priors around a scene's values, weighed against observations of this noise.
+
+    Args:
+        scene: the start, whose values are what is known.
+        settings: how well.
+        columns: (C, BORDER_SIZE); what is held needs no prior.
+        sigma_px: noise of one image coordinate.
+
+    Returns:
+        None if nothing refined has a prior.
+    """
+    reference = State.from_scene(scene)
+    stddevs = np.full(columns.shape, np.inf)
+    stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
+    stddevs[:, border.DISTANCE] = settings.distance_stddev_m or np.inf
+    # The prior is on the angle's two components; its RMS angle is sqrt(2) of one.
+    tilt = np.radians(settings.normal_stddev_deg or np.inf) / np.sqrt(2.0)
+    stddevs[:, border.NORMAL] = tilt
+    stddevs[0, border.WATER_INDEX] = settings.water_index_stddev or np.inf
+    relative = settings.focal_stddev or np.inf
+    stddevs[:, [_FX, _FY]] = relative * reference.lenses[:, :2]
+    stddevs[:, [_CX, _CY]] = settings.principal_point_stddev_px or np.inf
+    stddevs[:, _DISTORTION] = settings.distortion_stddev or np.inf
+    shared = columns[:, _FX] == columns[:, _FY]
+    stddevs[shared, _FY] = np.inf  # one focal length, known once
+    weights = np.where(columns != HELD, (sigma_px / stddevs) ** 2, 0.0)
+    return Priors(reference=reference, weights=weights) if weights.any() else None

@@ -1,0 +1,25 @@
+"""Parameters of one camera that all frames share: the columns of the *border*.
+
+Rotations, directions and normals move in their tangent planes; everything else adds.
+"""
+
+from typing import Final
+
+ROTATION: Final = slice(0, 3)
+"""Of cam_from_rig, left tangent, radians."""
+DIRECTION: Final = slice(3, 5)
+"""Of cam_from_rig's translation, radians."""
+LENGTH: Final = 5
+"""Of cam_from_rig's translation, metres."""
+NORMAL: Final = slice(6, 8)
+"""Of the port, radians."""
+DISTANCE: Final = 8
+"""Of the port, metres."""
+WATER_INDEX: Final = 9
+THICKNESS: Final = 10
+"""Of the glass, metres."""
+GLASS_INDEX: Final = 11
+LENS: Final = slice(12, 24)
+"""fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, as in `uwsfm.models.lens`."""
+FIRST_LENS: Final = 12
+BORDER_SIZE: Final = 24
