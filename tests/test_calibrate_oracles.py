@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwsfm import calibrate
 from uwsfm.geometry import rigid3, unit_vector
+from uwsfm.residuals.border import BORDER_SIZE, WATER_INDEX
 from uwsfm.simulate import (
     ObservationOptions,
     Perturbation,
@@ -122,7 +123,7 @@ def _border_errors(result, truth):
             0.0,
             *(unit_vector.tangent_basis(true_port.normal).T @ port.normal),
             port.distance - true_port.distance,
-            0.0,
+            *np.zeros(BORDER_SIZE - WATER_INDEX),
         ]
         free = cols[c] >= 0
         errors[cols[c][free]] = np.array(values)[free]

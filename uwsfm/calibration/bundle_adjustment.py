@@ -58,10 +58,7 @@ def calibrate(
         InputError: an unknown option, or a scene that cannot determine what is asked.
         UwsfmError: the solver ended where nothing is physical.
     """
-    try:
-        settings = CalibrateOptions(**options)
-    except TypeError as error:
-        raise InputError(f"calibrate: {error}") from None
+    settings = CalibrateOptions.parsed(options)
     _check(scene, settings)
     began = time.perf_counter()
     everything = np.ones(scene.num_observations, dtype=bool)

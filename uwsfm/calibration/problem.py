@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,18 @@ class CalibrateOptions:
                 f"baseline_stddev_m must be >= 0, got {self.baseline_stddev_m}"
             )
         self._check_error()
+
+    @classmethod
+    def parsed(cls, options: dict[str, Any]) -> "CalibrateOptions":
+        """Options by name.
+
+        Raises:
+            InputError: an unknown name, or a value out of range.
+        """
+        try:
+            return cls(**options)
+        except TypeError as error:
+            raise InputError(f"calibrate: {error}") from None
 
     def _check_error(self) -> None:
         """Refuse what another error than reprojection does not determine."""

@@ -1,14 +1,17 @@
 """What is known of the estimates at an optimum: covariances and standard deviations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.problem import CameraCovariance, Covariance
+from uwsfm.calibration.priors import border_priors
+from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
+from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border as border_of
-from uwsfm.scene import IndexArray
+from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.clustered import clustered_covariance
 from uwsfm.solver.covariance import (
     ReducedCovariance,
@@ -16,7 +19,7 @@ from uwsfm.solver.covariance import (
     reduced_covariance,
 )
 from uwsfm.solver.error_models import error_model
-from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.layout import HELD, Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import (
     LevenbergMarquardtOptions,
     Priors,
@@ -77,6 +80,50 @@ def posterior_covariance(optimum: Optimum) -> Covariance:
         frames=variance * reduced.frames(layout),
         points=points,
         cameras=tuple(cameras),
+        determined=reduced.determined,
+    )
+
+
+def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covariance:
+    """What observations like these can tell at best: the Cramer-Rao bound.
+
+    Args:
+        scene: its values are taken for the truth; only the places of its observations
+            matter, not their errors.
+        noise_px: standard deviation of every image coordinate, errors independent.
+        **options: fields of `CalibrateOptions`.
+
+    Raises:
+        InputError: an unknown option, or observations that cannot be made.
+    """
+    settings = CalibrateOptions.parsed(options)
+    if not noise_px > 0.0:
+        raise InputError(f"noise_px must be positive, got {noise_px}")
+    pixels, valid = scene.projections()
+    if not np.all(valid):
+        row = int(np.nonzero(~valid)[0][0])
+        raise InputError(
+            f"observation {row} cannot be made: its point does not project"
+        )
+    scene = replace(scene, xy=pixels)
+    at_zero = np.zeros(len(scene.cameras), dtype=bool)
+    models = [camera.camera.model_name for camera in scene.cameras]
+    columns = settings.border_columns(models, at_zero)
+    layout, state = build_layout(scene, columns), State.from_scene(scene)
+    priors = border_priors(scene, settings, columns, noise_px)
+    eqs = likelihood(layout, state, priors)
+    reduced = reduced_covariance(layout, eqs)
+    variance = noise_px**2
+    border = variance * reduced.border(layout)
+    return Covariance(
+        border=border,
+        border_cols=columns,
+        frames=variance * reduced.frames(layout),
+        points=variance * point_covariances(layout, eqs, reduced),
+        cameras=tuple(
+            _camera_covariance(camera_variances(border, cols, pose), False)
+            for cols, pose in zip(columns, scene.cam_from_rig, strict=True)
+        ),
         determined=reduced.determined,
     )
 
