@@ -32,7 +32,7 @@ class Task:
 def solve(task: Task) -> list[Row]:
     """Every start of one dive: whether and how fast the adjustment comes back."""
     dive = simulate(Dive(case=task.case, noise_px=NOISE_PX, seed=task.seed))
-    begin = perspective_adjustment(dive.scene)
+    begin, _ = perspective_adjustment(dive.scene)
     rng = np.random.default_rng(task.seed)
     warm_up(**OPTIONS)
     rows = []

@@ -20,19 +20,19 @@ SERIES = {
 
 def compute(settings: Settings) -> Iterator[tuple[str, list[Row]]]:
     yield "fig7", many_pairs.table(settings.runs, settings.processes)
-    yield "fig7_basin", basin.table(max(settings.runs // 4, 2), settings.processes)
+    yield "fig7_basin", basin.table(settings.runs, settings.processes)
 
 
 def plot(found: Tables, out: Path) -> None:
     figure = new_figure(11.0, 3.5)
     normal, distance, ratio = figure.subplots(1, 3)
-    for index, (name, (case, strategy)) in enumerate(SERIES.items()):
-        rows = select(found["fig7"], case=case, strategy=strategy)
+    for index, (name, (case, method)) in enumerate(SERIES.items()):
+        rows = select(found["fig7"], case=case, method=method)
         noise = column(rows, "noise_px")
         shift = 0.018 * (index - 1)
         for axes, mean, stddev in (
             (normal, "normal_mean_deg", "normal_sd_deg"),
-            (distance, "distance_mean_error_mm", "distance_sd_mm"),
+            (distance, "distance_mean_mm", "distance_sd_mm"),
         ):
             bars(axes, noise, column(rows, mean), column(rows, stddev), name, shift)
         noisy = [row for row in rows if row["noise_px"] > 0.0]
@@ -48,7 +48,7 @@ def plot(found: Tables, out: Path) -> None:
                 color=COLORS[name],
                 label=f"{what}s, {name}",
             )
-    rows = select(found["fig7"], case="glass 5 mm", strategy="joint")
+    rows = select(found["fig7"], case="glass 5 mm", method="joint")
     noise, bound = column(rows, "noise_px"), column(rows, "distance_bound_mm")
     normal.plot(noise, column(rows, "normal_bound_deg"), "k--", linewidth=1.1)
     for sign in (-1.0, 1.0):
@@ -73,15 +73,16 @@ def _label(axes, title: str, unit: str) -> None:
 
 def section(found: Tables) -> str:
     """What the README says."""
-    rows = found["fig7"]
+    known = select(found["fig7"], case="distances known")
+    rows = [row for row in found["fig7"] if row not in known]
     exact = select(rows, noise_px=0.0)
     noisy = [row for row in rows if row["noise_px"] > 0.0]
-    joint = select(rows, case="glass 5 mm", strategy="joint")
-    nested = select(rows, case="glass 5 mm", strategy="nested")
+    joint = select(rows, case="glass 5 mm", method="joint")
+    nested = select(rows, case="glass 5 mm", method="nested")
     common = {
         "case": ("case", ""),
         "noise_px": ("noise, px", "g"),
-        "strategy": ("strategy", ""),
+        "method": ("method", ""),
     }
     return TEXT.format(
         runs=int(rows[0]["runs"]),
@@ -108,17 +109,17 @@ def section(found: Tables) -> str:
             common
             | {
                 "normal_max_deg": ("largest normal error, deg", ".1e"),
-                "distance_max_error_mm": ("largest distance error, mm", ".1e"),
+                "distance_max_mm": ("largest distance error, mm", ".1e"),
             },
         ),
         behaviour=markdown(
             rows,
             common
             | {
-                "z_normal_mean": ("z of normals: mean", ".2f"),
-                "z_normal_sd": ("sd", ".2f"),
-                "z_distance_mean": ("z of distances: mean", ".2f"),
-                "z_distance_sd": ("sd", ".2f"),
+                "normal_z_mean": ("z of normals: mean", ".2f"),
+                "normal_z_sd": ("sd", ".2f"),
+                "distance_z_mean": ("z of distances: mean", ".2f"),
+                "distance_z_sd": ("sd", ".2f"),
                 "converged_percent": ("converged, %", ".0f"),
                 "iterations_mean": ("iterations: mean", ".1f"),
                 "iterations_max": ("max", ".0f"),
@@ -132,8 +133,32 @@ def section(found: Tables) -> str:
             | {f"{s:g}": (f"distance x {s:g}", "") for s in basin.DISTANCE_SCALES},
         ),
         basin_runs=int(found["fig7_basin"][0]["runs"]),
+        errors=markdown(
+            known,
+            {
+                "noise_px": ("noise, px", "g"),
+                "method": ("error function", ""),
+                "normal_rmse_deg": ("normal RMSE, deg", ".4f"),
+                "normal_bound_deg": ("bound", ".4f"),
+                "normal_ratio": ("ratio", ".2f"),
+                "normal_ratio_error": ("±", ".2f"),
+                "iterations_mean": ("iterations: mean", ".1f"),
+                "solve_median_s": ("solve, s: median", ".2f"),
+            },
+        ),
+        pinhole_px=joint[0]["pinhole_px"],
+        low=min(_ratios(joint)),
+        high=max(_ratios(joint)),
+        worst_s=max(column(joint, "solve_max_s")),
+        nested_low=min(_ratios(nested)),
+        nested_high=max(_ratios(nested)),
         slower=_mean(nested, "solve_median_s") / _mean(joint, "solve_median_s"),
     )
+
+
+def _ratios(rows: list[Row]) -> list[float]:
+    noisy = [row for row in rows if row["noise_px"] > 0.0]
+    return column(noisy, "normal_ratio") + column(noisy, "distance_ratio")
 
 
 def _mean(rows: list[Row], name: str) -> float:
@@ -156,23 +181,25 @@ TEXT = """## Figure 7: ports from many pairs
 ![Errors of normals and distances against noise, and their ratio to the bound](fig7.png)
 
 15 pairs of a rich motion, {points} points, about {observations:.0f} observations, true
-distances 20 mm, tilts 2 and 1 degrees. Every run has a sea floor and noise of its own
-({runs} runs per line). The start is the paper's: a perspective bundle adjustment of the
-noisy observations (it leaves frame rotations {start_deg:.2f} degrees off), straight
-ports at 10 mm. With these ports the observations miss their points by {start_px:.0f}
-px. RMSE and bound (Cramér and Rao) are pooled over both cameras; ± is the Monte-Carlo
-error of the ratio.
+distances 20 mm, tilts 2 and 1 degrees; {runs} runs per line, each with a sea floor and
+noise of its own. The start is the paper's: a perspective bundle adjustment of the noisy
+observations from the true geometry, then straight ports at 10 mm. On exact observations
+the pinholes reach {pinhole_px:.2f} px RMS, and get there by turning the frames by
+{start_deg:.2f} deg RMS: what the paper says of the poses, which absorb part of the
+error. RMSE and bound (Cramér and Rao) are pooled over both cameras; ± is the
+Monte-Carlo error of the ratio.
 
 {accuracy}
 
-The outliers' bound is that of the same dive without outliers. With exact observations
-there is nothing to compare with:
+The bound of the dives with outliers is that of the same dives without. With exact
+observations there is nothing to compare with:
 
 {exact}
 
-z: (estimate - truth) / reported standard deviation, which allows for neighbouring
-features that err together, so a spread slightly below 1 is right here. Times are those
-of the solve, two at a time on two cores; the paper reports about 3 hours.
+z: (estimate - truth) / reported standard deviation. What is reported allows for
+neighbouring features that err together, so a spread slightly below 1 is right here.
+Times are those of the solve, without the perspective start and the covariance; the
+paper reports about 3 hours.
 
 {behaviour}
 
@@ -181,9 +208,16 @@ share that converges (and the most iterations), {basin_runs} dives each.
 
 {basin}
 
-**The paper** shows errors of normals and distances of both cameras against noise, after
-3 hours each. **Here** the joint adjustment is at the bound, in a fraction of a second.
-The paper's nested loops reach the same optimum, {slower:.0f} times slower. **Where it
-loses**: nowhere on such data; a flat floor from one altitude leaves the distances
-undetermined, whatever the solver.
+The error functions with the distances known, the rest as above. The error in space is
+as sensitive to noise as the paper says:
+
+{errors}
+
+**The paper** shows errors of normals and distances of both cameras against noise, on
+one scene, after 3 hours. **Here** the joint adjustment stays within {low:.2f} to
+{high:.2f} times the bound, in at most {worst_s:.2f} s. The paper's nested loops (their
+fixed point found as a root: repeated as printed they need hundreds of passes) reach
+{nested_low:.2f} to {nested_high:.2f} times the bound, {slower:.0f} times slower.
+**Where it loses**: nowhere on such data. But this motion is rich: a flat floor from one
+altitude leaves the distances undetermined, whatever the solver.
 """

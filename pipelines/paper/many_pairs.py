@@ -4,8 +4,8 @@ As in the paper, the start is made by a perspective bundle adjustment of the noi
 observations; then the ports start straight and at 10 mm, and everything moves.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -26,9 +26,11 @@ from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import finite_rows
 from uwsfm.scene import Scene
 from uwsfm.simulate import (
     ObservationOptions,
+    Perturbation,
     Relief,
     SimulatedScene,
     perturbed,
@@ -38,9 +40,10 @@ from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion
 
 NOISES_PX = (0.0, 0.1, 0.25, 0.5, 1.0)
-STRATEGIES = ("joint", "nested")
 NUM_FRAMES = 15
 NUM_POINTS = 800
+STRATEGIES: dict[str, dict] = {"joint": {}, "nested": {"strategy": "nested"}}
+ERRORS = ("reprojection", "virtual_camera", "virtual_camera_tangential", "point_3d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,10 +51,14 @@ class Case:
     """One block of the table."""
 
     name: str
+    methods: Mapping[str, Mapping[str, Any]] = field(
+        default_factory=lambda: {"joint": {}}
+    )
+    """Name -> options of `uwsfm.calibrate`."""
     thickness_mm: float = 5.0
     outlier_ratio: float = 0.0
+    distances_known: bool = False
     noises_px: Sequence[float] = NOISES_PX
-    strategies: Sequence[str] = STRATEGIES
     num_frames: int = NUM_FRAMES
     num_points: int = NUM_POINTS
 
@@ -60,15 +67,20 @@ class Case:
         """Least squares are optimal for Gaussian noise, and lost with outliers."""
         return "cauchy" if self.outlier_ratio > 0.0 else "l2"
 
+    @property
+    def held(self) -> dict[str, Any]:
+        return {"refine_distances": False} if self.distances_known else {}
+
 
 CASES = (
-    Case(name="glass 5 mm"),
-    Case(name="glass 30 mm", thickness_mm=30.0, strategies=("joint",)),
+    Case(name="glass 5 mm", methods=STRATEGIES),
+    Case(name="glass 30 mm", thickness_mm=30.0),
+    Case(name="15 % outliers", outlier_ratio=0.15, noises_px=(0.5,)),
     Case(
-        name="15 % outliers",
-        outlier_ratio=0.15,
-        noises_px=(0.5,),
-        strategies=("joint",),
+        name="distances known",
+        distances_known=True,
+        noises_px=(0.1, 0.5),
+        methods={error: {"error": error} for error in ERRORS},
     ),
 )
 
@@ -98,40 +110,48 @@ def simulate(task: Task) -> SimulatedScene:
     )
 
 
-def start(scene: Scene) -> Scene:
-    """What perspective Structure from Motion leaves, ports straight and at 10 mm."""
-    return perturbed(perspective_adjustment(scene))
+def start(scene: Scene, case: Case) -> tuple[Scene, float]:
+    """What perspective Structure from Motion leaves, and its pinholes' RMS error, px.
+
+    The ports are straight, and at 10 mm unless their distances are known.
+    """
+    adjusted, summary = perspective_adjustment(scene, loss=case.loss)
+    # A point whose observations were all rejected but one has no place.
+    placed = finite_rows(adjusted.points)[adjusted.point_idx]
+    adjusted, _ = adjusted.select(placed)
+    ports = Perturbation(distance_scale=1.0 if case.distances_known else 0.5)
+    return perturbed(adjusted, ports), summary.rms_px
 
 
 def solve(task: Task) -> list[Row]:
-    """All that is measured of one dive, a row per strategy."""
-    dive = simulate(task)
+    """All that is measured of one dive, a row per method."""
+    case, dive = task.case, simulate(task)
     # Of all observations, those that became outliers included: the clean bound.
-    unit_bound = predict_covariance(dive.truth, 1.0)
-    begin = start(dive.scene)
+    unit_bound = predict_covariance(dive.truth, 1.0, **case.held).cameras
+    begin, pinhole_px = start(dive.scene, case)
     rows = []
-    for strategy in task.case.strategies:
-        options = {"strategy": strategy, "loss": task.case.loss}
+    for method, chosen in case.methods.items():
+        options = {"loss": case.loss, **case.held, **chosen}
         warm_up(**options)
         result = uwsfm.calibrate(begin, **options)
         normal_z, distance_z = z_scores(result, dive.truth)
         rows.append(
             {
-                "case": task.case.name,
+                "case": case.name,
                 "noise_px": task.noise_px,
-                "strategy": strategy,
+                "method": method,
                 "normal_deg": normal_errors_deg(result.scene, dive.truth),
                 "normal_bound_deg": [
-                    task.noise_px * camera.normal_stddev_deg
-                    for camera in unit_bound.cameras
+                    task.noise_px * camera.normal_stddev_deg for camera in unit_bound
                 ],
                 "normal_z": normal_z,
                 "distance_mm": distance_errors_mm(result.scene, dive.truth),
                 "distance_bound_mm": [
                     1e3 * task.noise_px * camera.distance_stddev_m
-                    for camera in unit_bound.cameras
+                    for camera in unit_bound
                 ],
                 "distance_z": distance_z,
+                "pinhole_px": pinhole_px,
                 "start_rotation_deg": _rotation_error_deg(begin, dive.truth),
                 "start_px": result.summary.initial_rms_px,
                 "converged": at_optimum(result, task.noise_px),
@@ -158,7 +178,7 @@ def _rotation_error_deg(found: Scene, truth: Scene) -> float:
 
 
 def table(runs: int, processes: int, cases: Sequence[Case] = CASES) -> list[Row]:
-    """Figure 7: a row per case, noise level and strategy."""
+    """Figure 7: a row per case, noise level and method."""
     tasks = [
         Task(case=case, noise_px=noise, seed=seed)
         for case in cases
@@ -166,58 +186,46 @@ def table(runs: int, processes: int, cases: Sequence[Case] = CASES) -> list[Row]
     ]
     found = sum(run_all(solve, tasks, processes, "fig. 7"), [])
     return [
-        _summary(
-            select(found, case=case.name, noise_px=noise, strategy=strategy),
-            case.num_points,
-        )
+        _summary(select(found, case=case.name, noise_px=noise, method=method), case)
         for case in cases
-        for noise, strategy in product(case.noises_px, case.strategies)
+        for noise, method in product(case.noises_px, case.methods)
     ]
 
 
-def _summary(runs: list[Row], num_points: int) -> Row:
+def _summary(runs: list[Row], case: Case) -> Row:
     """One line of the table from its runs."""
-
-    def stack(name: str) -> np.ndarray:
-        return np.array(column(runs, name))
-
-    normal, distance = stack("normal_deg"), stack("distance_mm")
-    normal_bound, distance_bound = stack("normal_bound_deg"), stack("distance_bound_mm")
     exact = runs[0]["noise_px"] == 0.0
-    no_ratio: tuple[Any, Any] = (None, None)
-    normal_ratio = no_ratio if exact else rms_ratio(normal, normal_bound)
-    distance_ratio = no_ratio if exact else rms_ratio(distance, distance_bound)
-    seconds, iterations = stack("seconds"), stack("iterations")
+    row: Row = {name: runs[0][name] for name in ("case", "noise_px", "method")}
+    row |= {"runs": len(runs), "points": case.num_points}
+    row["observations"] = float(np.mean(column(runs, "observations")))
+    for name in ("pinhole_px", "start_rotation_deg", "start_px"):
+        row[name] = rms(column(runs, name))
+    row |= _accuracy(runs, "normal", "deg", compared=not exact)
+    known = case.distances_known
+    row |= _accuracy(runs, "distance", "mm", compared=not exact and not known)
+    row["converged_percent"] = 100.0 * float(np.mean(column(runs, "converged")))
+    iterations, seconds = column(runs, "iterations"), column(runs, "seconds")
+    row["iterations_mean"] = float(np.mean(iterations))
+    row["iterations_max"] = max(iterations)
+    row["solve_median_s"] = float(np.median(seconds))
+    row["solve_max_s"] = max(seconds)
+    return row
+
+
+def _accuracy(runs: list[Row], what: str, unit: str, *, compared: bool) -> Row:
+    """Errors of both cameras, their bound, and their scores if there is a bound."""
+    errors = np.array(column(runs, f"{what}_{unit}"))  # (runs, cameras)
+    bounds = np.array(column(runs, f"{what}_bound_{unit}"))
+    ratio, ratio_error = rms_ratio(errors, bounds) if compared else (None, None)
+    z = np.array(column(runs, f"{what}_z"))
     return {
-        "case": runs[0]["case"],
-        "noise_px": runs[0]["noise_px"],
-        "strategy": runs[0]["strategy"],
-        "runs": len(runs),
-        "points": num_points,
-        "observations": float(np.mean(stack("observations"))),
-        "start_rotation_deg": rms(stack("start_rotation_deg")),
-        "start_px": rms(stack("start_px")),
-        "normal_mean_deg": float(np.mean(normal)),
-        "normal_sd_deg": float(np.std(normal)),
-        "normal_max_deg": float(np.max(normal)),
-        "normal_rmse_deg": rms(normal),
-        "normal_bound_deg": rms(normal_bound),
-        "normal_ratio": normal_ratio[0],
-        "normal_ratio_error": normal_ratio[1],
-        "distance_mean_error_mm": float(np.mean(distance)),
-        "distance_sd_mm": float(np.std(distance)),
-        "distance_max_error_mm": float(np.max(np.abs(distance))),
-        "distance_rmse_mm": rms(distance),
-        "distance_bound_mm": rms(distance_bound),
-        "distance_ratio": distance_ratio[0],
-        "distance_ratio_error": distance_ratio[1],
-        "z_normal_mean": None if exact else float(np.mean(stack("normal_z"))),
-        "z_normal_sd": None if exact else float(np.std(stack("normal_z"))),
-        "z_distance_mean": None if exact else float(np.mean(stack("distance_z"))),
-        "z_distance_sd": None if exact else float(np.std(stack("distance_z"))),
-        "converged_percent": 100.0 * float(np.mean(stack("converged"))),
-        "iterations_mean": float(np.mean(iterations)),
-        "iterations_max": int(np.max(iterations)),
-        "solve_median_s": float(np.median(seconds)),
-        "solve_max_s": float(np.max(seconds)),
+        f"{what}_mean_{unit}": float(np.mean(errors)),
+        f"{what}_sd_{unit}": float(np.std(errors)),
+        f"{what}_max_{unit}": float(np.max(np.abs(errors))),
+        f"{what}_rmse_{unit}": rms(errors),
+        f"{what}_bound_{unit}": rms(bounds),
+        f"{what}_ratio": ratio,
+        f"{what}_ratio_error": ratio_error,
+        f"{what}_z_mean": float(np.mean(z)) if compared else None,
+        f"{what}_z_sd": float(np.std(z)) if compared else None,
     }

@@ -100,12 +100,14 @@ def z_scores(result: CalibrationResult, truth: Scene) -> tuple[Array, Array]:
     for camera, reported in enumerate(cov.cameras):
         found, true = result.scene.ports[camera], truth.ports[camera]
         columns = cov.border_cols[camera, 6:8]
-        variances = np.diag(cov.border[np.ix_(columns, columns)])
+        variances = np.diag(cov.border)[columns]
         # What is reported allows for neighbours that err together: it is not smaller.
         scale = np.radians(reported.normal_stddev_deg) / np.sqrt(np.sum(variances))
         offset = -tangent_basis(found.normal).T @ true.normal
         normals.append(offset / (scale * np.sqrt(variances)))
-        distances.append((found.distance - true.distance) / reported.distance_stddev_m)
+        stddev = reported.distance_stddev_m
+        held = stddev == 0.0
+        distances.append(0.0 if held else (found.distance - true.distance) / stddev)
     return np.array(normals), np.array(distances)
 
 

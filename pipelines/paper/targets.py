@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from single_pair import ERRORS
 from tables import Row, Tables, markdown, select
 
 
@@ -25,7 +26,7 @@ def _line(goal: str, found: str, met: bool) -> Row:
 
 
 def _single_pair(rows: list[Row]) -> Iterator[Row]:
-    for error in dict.fromkeys(row["error_function"] for row in rows):
+    for error in ERRORS:
         ratios = [
             row["rmse_over_bound_both"]
             for row in select(rows, error_function=error)
@@ -39,10 +40,11 @@ def _single_pair(rows: list[Row]) -> Iterator[Row]:
 
 
 def _many_pairs(rows: list[Row]) -> Iterator[Row]:
-    for case, strategy in dict.fromkeys((r["case"], r["strategy"]) for r in rows):
-        mine = select(rows, case=case, strategy=strategy)
+    goals = [row for row in rows if row["case"] != "distances known"]
+    for case, method in dict.fromkeys((r["case"], r["method"]) for r in goals):
+        mine = select(rows, case=case, method=method)
         clean = "outliers" not in case
-        name = f"many pairs, {case}, {strategy}"
+        name = f"many pairs, {case}, {method}"
         ratios = [
             row[f"{what}_ratio"]
             for row in mine
@@ -57,7 +59,7 @@ def _many_pairs(rows: list[Row]) -> Iterator[Row]:
         yield _line(f"{name}: {goal}", f"{low:.2f} to {high:.2f}", met)
         share = min(row["converged_percent"] for row in mine)
         yield _line(f"{name}: all runs converge", f"{share:.0f} %", share == 100.0)
-        if clean and strategy == "joint":
+        if clean and method == "joint":
             count = max(row["iterations_max"] for row in mine)
             yield _line(f"{name}: at most 8 iterations", f"{count:.0f}", count <= 8)
             typical = max(row["solve_median_s"] for row in mine)
