@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig, load_rig
 from uwsfm.sfm.background import opened
-from uwsfm.sfm.options import FeatureOptions, StartOptions
+from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, read_start
 from uwsfm.sfm.start import perspective_start
 
@@ -168,6 +169,28 @@ def test_another_port_repeats_geometry_but_not_matching(rig, image_dir, finished
         other, image_dir, work_dir, OPTIONS, lambda name, *_: seen.append(name)
     )
     assert set(seen) == {"verifying", "mapping"}
+
+
+def test_another_matcher_repeats_matching_but_not_features(
+    rig, image_dir, finished, tmp_path
+):
+    """And with the paper's matcher so does another seed: its trees are random."""
+    work_dir = tmp_path / "work"
+    shutil.copytree(finished[0], work_dir)
+    options = replace(OPTIONS, matching=MatchOptions(matcher="paper"))
+    repeated = ["matching", "verifying", "mapping"]
+    for how, expected in (
+        (options, repeated),
+        (options, []),
+        (replace(options, seed=1), repeated),
+    ):
+        seen: list[str] = []
+        start = perspective_start(
+            rig, image_dir, work_dir, how, lambda name, *_, seen=seen: seen.append(name)
+        )
+        assert set(seen) == set(expected)
+    assert read_start(start).rig_from_world.shape == (NUM_FRAMES, 7)
+    assert start.summary["mean_error_px"] < 1.0
 
 
 def test_exchanged_folders_keep_their_features(rig, image_dir, finished):

@@ -80,6 +80,10 @@ def reconstruct(
         Literal["auto", "exhaustive", "sequential"],
         typer.Option(help="Which frames are compared; auto: by their number."),
     ] = "auto",
+    matcher: Annotated[
+        Literal["colmap", "paper"],
+        typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
+    ] = "colmap",
     seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
@@ -98,6 +102,7 @@ def reconstruct(
             clahe=clahe,
             masks=masks,
             matching=matching,
+            matcher=matcher,
             seed=seed,
             num_threads=threads,
             progress=progress,

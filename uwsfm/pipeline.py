@@ -29,7 +29,13 @@ from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colors import point_colors
 from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.options import FeatureOptions, Matching, MatchOptions, StartOptions
+from uwsfm.sfm.options import (
+    FeatureOptions,
+    Matcher,
+    Matching,
+    MatchOptions,
+    StartOptions,
+)
 from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
 from uwsfm.sfm.refine import Refined, refine_scene
 from uwsfm.sfm.start import perspective_start
@@ -61,6 +67,7 @@ def reconstruct(
     clahe: bool = False,
     masks: str | Path | None = None,
     matching: Matching = "auto",
+    matcher: Matcher = "colmap",
     seed: int = 0,
     num_threads: int = -1,
     progress: Progress = silent,
@@ -79,6 +86,7 @@ def reconstruct(
         clahe: Equalise contrast locally before the search for features.
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
+        matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
         seed: Of all random choices.
         num_threads: -1 for all cores.
         progress: Called with each long step.
@@ -99,7 +107,7 @@ def reconstruct(
         features=FeatureOptions(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)
         ),
-        matching=MatchOptions(strategy=matching),
+        matching=MatchOptions(strategy=matching, matcher=matcher),
         seed=seed,
         num_threads=num_threads,
     )

@@ -24,6 +24,7 @@ from uwsfm.solver.levenberg_marquardt import (
     LevenbergMarquardtOptions,
     Priors,
     Problem,
+    suitable_blas,
 )
 from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.state import State, translation_arm
@@ -58,6 +59,11 @@ class Optimum:
 def posterior_covariance(optimum: Optimum) -> Covariance:
     """Covariances from the noise found, and standard deviations that neighbours' shared
     errors cannot beat."""
+    with suitable_blas(optimum.layout):
+        return _posterior_covariance(optimum)
+
+
+def _posterior_covariance(optimum: Optimum) -> Covariance:
     layout = optimum.layout
     eqs = likelihood(layout, optimum.state, optimum.priors)
     reduced = reduced_covariance(layout, eqs)

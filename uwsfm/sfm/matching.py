@@ -1,4 +1,4 @@
-"""Feature matches between pairs of images, raw: geometry is verified later."""
+"""Feature matches between pairs of images; the rig's geometry is verified later."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.sfm.background import opened, run_with_database
 from uwsfm.sfm.images import Frames
-from uwsfm.sfm.options import MatchOptions
+from uwsfm.sfm.options import MatchOptions, thread_count
+from uwsfm.sfm.paper_matching import match_pairs
 
 BLOCK_SIZE = 200  # pairs between two looks at Ctrl-C
 
@@ -47,6 +48,7 @@ def match_features(
     database_path: Path,
     options: MatchOptions,
     *,
+    seed: int = 0,
     num_threads: int = -1,
     progress: Progress = silent,
 ) -> None:
@@ -55,11 +57,32 @@ def match_features(
     Args:
         frames: The images, with features in the database.
         database_path: Receives the matches.
-        options: Which pairs.
+        options: Which pairs, and how.
+        seed: Of the paper's matcher; COLMAP's takes none.
         num_threads: -1 for all cores.
         progress: Called with the step "matching".
     """
     pairs = image_pairs(frames, options)
+    if options.matcher == "paper":
+        match_pairs(
+            pairs,
+            database_path,
+            max_error_px=options.fundamental_max_error_px,
+            seed=seed,
+            num_threads=thread_count(num_threads),
+            progress=progress,
+        )
+    else:
+        _match_with_colmap(pairs, database_path, num_threads, progress)
+    progress("matching", len(pairs), len(pairs))
+
+
+def _match_with_colmap(
+    pairs: list[tuple[str, str]],
+    database_path: Path,
+    num_threads: int,
+    progress: Progress,
+) -> None:
     list_path = database_path.parent / "pairs.txt"
     with replaced_file(list_path) as partial:
         partial.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
@@ -87,7 +110,6 @@ def match_features(
             "matching", database.num_matched_image_pairs(), len(pairs)
         ),
     )
-    progress("matching", len(pairs), len(pairs))
 
 
 def clear_matches(database_path: Path) -> None:

@@ -15,8 +15,9 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
+from uwsfm.sfm.epipolar import ray_pairs, relative_pose
 from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, RigRotation, correct_rotations
-from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
+from uwsfm.sfm.same_frame import PairMatches
 
 MIN_IN_FRONT = 0.5
 CLEARLY_IN_FRONT = 0.8

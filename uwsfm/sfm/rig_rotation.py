@@ -17,7 +17,8 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
-from uwsfm.sfm.same_frame import PairMatches, ray_pairs, relative_pose
+from uwsfm.sfm.epipolar import ray_pairs, relative_pose
+from uwsfm.sfm.same_frame import PairMatches
 
 MIN_RIG_MATCHES = 30
 """Over all frames; a pair of cameras with fewer tells nothing about the rig."""

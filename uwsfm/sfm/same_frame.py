@@ -10,8 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm.geometry import rigid3
-from uwsfm.geometry.rays import closest_points, finite_rows
+from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
@@ -127,60 +126,3 @@ def _direction_image(camera: RefractiveCamera, xy: Array) -> Array:
     """Where the water rays of pixels point: x/z, y/z (N, 2); NaN without a ray."""
     _, dirs = camera.ray_from_img(xy)
     return dirs[:, :2] / dirs[:, 2:]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RayPairs:
-    """Water rays of matches, both in the frame of the first camera."""
-
-    origins_a: Array
-    dirs_a: Array
-    origins_b: Array
-    dirs_b: Array
-
-    def epipolar_angles(self) -> Array:
-        """By how much each pair of rays misses coplanarity (N,), signed radians.
-
-        The Sampson error on the unit sphere: the least turn of both rays that makes
-        them and the line between their origins lie in one plane.
-        """
-        between = self.origins_b - self.origins_a
-        normal_a = np.cross(between, self.dirs_a)
-        normal_b = np.cross(between, self.dirs_b)
-        volume = np.einsum("ni,ni->n", normal_a, self.dirs_b)
-        square = np.sum(normal_a**2, axis=1) + np.sum(normal_b**2, axis=1)
-        return volume / np.sqrt(np.maximum(square, 1e-300))
-
-    def triangulate(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Midpoints (N, 3) in the first camera, and which lie in front of both."""
-        points, ranges, _ = closest_points(
-            self.origins_a, self.dirs_a, self.origins_b, self.dirs_b
-        )
-        with np.errstate(invalid="ignore"):
-            return points, np.all(ranges > 0.0, axis=1)
-
-
-def ray_pairs(
-    camera_a: RefractiveCamera,
-    camera_b: RefractiveCamera,
-    b_from_a: Array,
-    xy_a: Array,
-    xy_b: Array,
-) -> RayPairs:
-    """Water rays of matched pixels (N, 2) each, for a relative pose (7,)."""
-    origins_a, dirs_a = camera_a.ray_from_img(xy_a)
-    origins_b, dirs_b = camera_b.ray_from_img(xy_b)
-    a_from_b = rigid3.inverse(b_from_a)
-    return RayPairs(
-        origins_a=origins_a,
-        dirs_a=dirs_a,
-        origins_b=rigid3.transform(a_from_b, origins_b),
-        dirs_b=rigid3.rotate(a_from_b, dirs_b),
-    )
-
-
-def relative_pose(cam_from_rig: Array, camera_a: int, camera_b: int) -> Array:
-    """Pose b_from_a (7,) of two cameras of a rig (C, 7)."""
-    return rigid3.compose(
-        cam_from_rig[camera_b], rigid3.inverse(cam_from_rig[camera_a])
-    )

@@ -210,13 +210,16 @@ def _match_images(
 
     key = steps.run("features", inputs, extract, outputs=[space.features], clear=forget)
     store_intrinsics(frames, rig, space.features)
+    # COLMAP's matches do not depend on the seed: another one must not repeat them.
+    seeds = [options.seed] if options.matching.matcher == "paper" else []
     return steps.run(
         "matches",
-        [key, asdict(options.matching)],
+        [key, asdict(options.matching), seeds],
         lambda: match_features(
             frames,
             space.features,
             options.matching,
+            seed=options.seed,
             num_threads=options.threads,
             progress=progress,
         ),

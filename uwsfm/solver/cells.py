@@ -78,29 +78,49 @@ def linearized_residual(layout, state, i, x, y, z, j_port, j_rig, j_border):
 
 
 @kernel
-def _add_rows(layout, camera, j_rig, j_border, rx, ry, weight, hess, grad, couple, out):
-    """Add two weighted rows of one camera to its cell's sums and to the border."""
-    start, stop = layout.free_start[camera], layout.free_start[camera + 1]
-    cols = layout.border_col[camera]
+def _add_rows(layout, camera, row, rx, ry, weight, work):
+    """Add two weighted rows of one camera to its cell's sums and to its own block."""
+    start = layout.free_start[camera]
+    num_free = layout.free_start[camera + 1] - start
+    block, grad = work.blocks[camera], work.block_grads[camera]
+    free = work.free
+    for s in range(num_free):
+        k = layout.free_slot[start + s]
+        b0, b1 = work.j_border[row, k], work.j_border[row + 1, k]
+        free[0, s], free[1, s] = weight * b0, weight * b1
+        grad[s] += weight * (b0 * rx + b1 * ry)
+        for t in range(s + 1):
+            block[s, t] += b0 * free[0, t] + b1 * free[1, t]
     for a in range(3):
-        ja0, ja1 = weight * j_rig[0, a], weight * j_rig[1, a]
-        grad[a] += ja0 * rx + ja1 * ry
-        for b in range(3):
-            hess[a, b] += ja0 * j_rig[0, b] + ja1 * j_rig[1, b]
-        for s in range(start, stop):
-            k = layout.free_slot[s]
-            couple[a, cols[k]] += ja0 * j_border[0, k] + ja1 * j_border[1, k]
-    for s in range(start, stop):
-        k = layout.free_slot[s]
-        jk0, jk1 = weight * j_border[0, k], weight * j_border[1, k]
-        out.border_grad[cols[k]] += jk0 * rx + jk1 * ry
-        for t in range(start, stop):
-            m = layout.free_slot[t]
-            out.border[cols[k], cols[m]] += jk0 * j_border[0, m] + jk1 * j_border[1, m]
+        a0, a1 = work.j_rig[row, a], work.j_rig[row + 1, a]
+        work.grad[a] += weight * (a0 * rx + a1 * ry)
+        for b in range(a + 1):
+            work.hess[a, b] += weight * (
+                a0 * work.j_rig[row, b] + a1 * work.j_rig[row + 1, b]
+            )
+        for s in range(num_free):
+            work.couple[a, layout.free_col[start + s]] += (
+                a0 * free[0, s] + a1 * free[1, s]
+            )
 
 
 @kernel
-def add_reprojection(layout, state, c, x, y, z, loss, scale, work, out):
+def scatter_blocks(layout, work, out):
+    """Add the cameras' own blocks to the border, where they may share columns."""
+    for camera in range(len(work.blocks)):
+        start = layout.free_start[camera]
+        for s in range(layout.free_start[camera + 1] - start):
+            col = layout.free_col[start + s]
+            out.border_grad[col] += work.block_grads[camera, s]
+            for t in range(s + 1):
+                other = layout.free_col[start + t]
+                out.border[col, other] += work.blocks[camera, s, t]
+                if t < s:
+                    out.border[other, col] += work.blocks[camera, s, t]
+
+
+@kernel
+def add_reprojection(layout, state, c, x, y, z, loss, scale, work):
     """Reprojection errors of a cell."""
     for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
         status, rx, ry = linearized_residual(
@@ -108,23 +128,11 @@ def add_reprojection(layout, state, c, x, y, z, loss, scale, work, out):
         )
         if status == VALID:
             _, weight = rho(rx * rx + ry * ry, loss, scale)
-            _add_rows(
-                layout,
-                layout.camera[i],
-                work.j_rig,
-                work.j_border,
-                rx,
-                ry,
-                weight,
-                work.hess,
-                work.grad,
-                work.couple,
-                out,
-            )
+            _add_rows(layout, layout.camera[i], 0, rx, ry, weight, work)
 
 
 @kernel
-def add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work, out):
+def add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work):
     """Virtual-camera errors of a cell: three rows each, and one of zeros."""
     unit2 = error.unit * error.unit
     sheet = error.code == VIRTUAL_CAMERA_TANGENTIAL
@@ -145,20 +153,8 @@ def add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work, out)
         if status != VALID:
             continue
         _, weight = rho(unit2 * (ex * ex + ey * ey + ez * ez), loss, scale)
-        for row, first, second in ((0, ex, ey), (2, ez, 0.0)):
-            _add_rows(
-                layout,
-                k,
-                work.j_rig[row:],
-                work.j_border[row:],
-                first,
-                second,
-                weight * unit2,
-                work.hess,
-                work.grad,
-                work.couple,
-                out,
-            )
+        _add_rows(layout, k, 0, ex, ey, weight * unit2, work)
+        _add_rows(layout, k, 2, ez, 0.0, weight * unit2, work)
 
 
 @kernel

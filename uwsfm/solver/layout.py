@@ -39,6 +39,8 @@ class Layout(NamedTuple):
     """(C + 1,) first of a camera's entries in ``free_slot``."""
     free_slot: IndexArray
     """Camera parameters that have a column, camera after camera."""
+    free_col: IndexArray
+    """Their columns."""
     free_lens: bool
     """Whether a lens parameter is among them."""
 
@@ -83,6 +85,7 @@ def build_layout(scene: Scene, border_col: IndexArray) -> Layout:
         order=order.astype(np.int64),
         free_start=np.empty(0, dtype=np.int64),
         free_slot=np.empty(0, dtype=np.int64),
+        free_col=np.empty(0, dtype=np.int64),
         free_lens=False,
     )
     return with_columns(layout, border_col)
@@ -95,5 +98,6 @@ def with_columns(layout: Layout, border_col: IndexArray) -> Layout:
         border_col=np.ascontiguousarray(border_col, dtype=np.int64),
         free_start=np.concatenate([[0], np.cumsum(free.sum(axis=1))]).astype(np.int64),
         free_slot=np.nonzero(free)[1].astype(np.int64),
+        free_col=np.ascontiguousarray(border_col[free], dtype=np.int64),
         free_lens=bool(np.any(free[:, LENS])),
     )

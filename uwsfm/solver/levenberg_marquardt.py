@@ -169,6 +169,12 @@ class Problem:
 Report = Callable[[int, float], None]
 
 
+def suitable_blas(layout: Layout) -> threadpool_limits:
+    """A context with as many BLAS threads as a reduced system is worth."""
+    size = layout.num_frame_cols + layout.num_border_cols
+    return threadpool_limits(1 if size < SINGLE_BLAS_BELOW else None, user_api="blas")
+
+
 def minimize(
     layout: Layout,
     start: State,
@@ -184,9 +190,7 @@ def minimize(
     Raises:
         UwsfmError: the start is so wrong that nothing can be projected.
     """
-    size = layout.num_frame_cols + layout.num_border_cols
-    limit = 1 if size < SINGLE_BLAS_BELOW else None
-    with threadpool_limits(limit, user_api="blas"):
+    with suitable_blas(layout):
         error = error_model(options.error, layout, start)
         problem = Problem(layout, error, options, priors)
         return _iterate(problem, start, options, report)

@@ -22,6 +22,7 @@ from uwsfm.solver.cells import (
     add_reprojection,
     add_virtual_camera,
     cell_cost,
+    scatter_blocks,
 )
 from uwsfm.solver.error_models import POINT_3D, REPROJECTION
 from uwsfm.solver.layout import Layout
@@ -127,11 +128,16 @@ def _expand_cell(x, y, z, frame, p, c, f, work, out):
 
 
 class Work(NamedTuple):
-    """Scratch of `linearize`: sums of a cell, Jacobians of an observation."""
+    """Scratch of `linearize`: sums of a cell, of a camera, Jacobians of a row."""
 
     hess: Array
+    """(3, 3), lower triangle."""
     grad: Array
     couple: Array
+    blocks: Array
+    """(C, BORDER_SIZE, BORDER_SIZE), lower triangles of what is free."""
+    block_grads: Array
+    free: Array
     j_port: Array
     j_rig: Array
     j_border: Array
@@ -144,6 +150,9 @@ def _work(num_border, num_cameras):
         np.empty((3, 3)),
         np.empty(3),
         np.empty((3, num_border)),
+        np.zeros((num_cameras, BORDER_SIZE, BORDER_SIZE)),
+        np.zeros((num_cameras, BORDER_SIZE)),
+        np.empty((2, BORDER_SIZE)),
         np.empty((2, 9)),
         np.zeros((4, 3)),  # a virtual camera's error has three rows and one of zeros
         np.zeros((4, BORDER_SIZE)),
@@ -161,14 +170,15 @@ def linearize(layout, state, error, loss, scale, out):
             x, y, z = point_in_rig(state.frames[f], state.points[p])
             work.hess[:], work.grad[:], work.couple[:] = 0.0, 0.0, 0.0
             if error.code == REPROJECTION:
-                add_reprojection(layout, state, c, x, y, z, loss, scale, work, out)
+                add_reprojection(layout, state, c, x, y, z, loss, scale, work)
             elif error.code == POINT_3D:
                 add_point_3d(layout, state, error, c, x, y, z, loss, scale, work, out)
             else:
-                add_virtual_camera(
-                    layout, state, error, c, x, y, z, loss, scale, work, out
-                )
+                add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work)
+            work.hess[0, 1], work.hess[0, 2] = work.hess[1, 0], work.hess[2, 0]
+            work.hess[1, 2] = work.hess[2, 1]
             _expand_cell(x, y, z, state.frames[f], p, c, f, work, out)
+    scatter_blocks(layout, work, out)
 
 
 @kernel
