@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from uwsfm.colmap import Model
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.background import opened
@@ -35,6 +36,30 @@ def frames_of(rig: Rig, num_frames: int, image_dir: Path) -> Frames:
         folders=tuple(camera.images for camera in rig.cameras),
         names=tuple(f"{index:04d}.png" for index in range(num_frames)),
         unmatched=(),
+    )
+
+
+def model_of(rig: Rig, scene: Scene) -> Model:
+    """A reconstruction with the observations of a scene as its keypoints."""
+    keypoint_idx = np.zeros(scene.num_observations, dtype=np.int64)
+    keypoints = []
+    for camera in range(len(scene.cameras)):
+        of_camera = []
+        for frame in range(scene.num_frames):
+            mine = (scene.camera_idx == camera) & (scene.frame_idx == frame)
+            rows = np.nonzero(mine)[0]
+            # One keypoint that no point uses comes first: indices are not rows.
+            keypoint_idx[rows] = 1 + np.arange(len(rows))
+            of_camera.append(np.vstack([[7.5, 8.5], scene.xy[rows]]))
+        keypoints.append(tuple(of_camera))
+    rng = np.random.default_rng(0)
+    return Model(
+        rig=rig,
+        scene=scene,
+        frame_names=tuple(f"{i:04}.jpg" for i in range(scene.num_frames)),
+        keypoints=tuple(keypoints),
+        keypoint_idx=keypoint_idx,
+        colors=rng.integers(0, 255, (scene.num_points, 3), dtype=np.uint8),
     )
 
 

@@ -162,6 +162,26 @@ def test_unsupported_lens_is_named(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--prior", "distance=1"], "--prior distance=1: the key is one of distance_s"),
+        (["--prior", "focal_stddev=a"], "'a' is not a number"),
+        (["--error", "point_3d"], "strategy='nested'"),
+        (
+            ["--strategy", "nested", "--refine", "focal", "-o", "x"],
+            "refine_focal needs",
+        ),
+        ([], "images does not exist"),
+    ],
+)
+def test_calibrate_names_the_mistake(tmp_path, options, words):
+    run("init", "rig.yaml", cwd=tmp_path)
+    arguments = ["calibrate", "rig.yaml", "images", "-o", "out", *options]
+    _one_sentence(run(*arguments, cwd=tmp_path), words)
+    assert {path.name for path in tmp_path.iterdir()} == {"rig.yaml"}
+
+
 def test_simulate_observations_calibrate_back(tmp_path):
     """The file holds all that `Scene.from_arrays` takes, and the truth."""
     found = run("simulate", "observations", "-o", "dive.npz", cwd=tmp_path)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pycolmap
 import pytest
+from sfm_scenes import model_of
 
 import uwsfm
 from uwsfm.colmap import Model, to_reconstruction
@@ -23,27 +24,7 @@ def model() -> Model:
     scene = simulate_scene(
         rig, rich_motion(4), None, ObservationOptions(num_points=60, noise_px=0.3)
     ).scene
-    keypoint_idx = np.zeros(scene.num_observations, dtype=np.int64)
-    keypoints = []
-    for camera in range(2):
-        of_camera = []
-        for frame in range(4):
-            rows = np.nonzero(
-                (scene.camera_idx == camera) & (scene.frame_idx == frame)
-            )[0]
-            # One keypoint that no point uses comes first: indices are not rows.
-            keypoint_idx[rows] = 1 + np.arange(len(rows))
-            of_camera.append(np.vstack([[7.5, 8.5], scene.xy[rows]]))
-        keypoints.append(tuple(of_camera))
-    rng = np.random.default_rng(0)
-    return Model(
-        rig=rig,
-        scene=scene,
-        frame_names=tuple(f"{i:04}.jpg" for i in range(4)),
-        keypoints=tuple(keypoints),
-        keypoint_idx=keypoint_idx,
-        colors=rng.integers(0, 255, (scene.num_points, 3), dtype=np.uint8),
-    )
+    return model_of(rig, scene)
 
 
 def test_stock_pycolmap_opens_the_model(model, tmp_path):
@@ -84,7 +65,7 @@ def test_point_errors_are_the_refractive_ones(model):
 
 def test_output_folder_reads_back(model, tmp_path):
     export_colmap(model, tmp_path / "sparse")
-    export_housing(model, tmp_path / "housing.yaml")
+    export_housing(model.rig, tmp_path / "housing.yaml")
     again = read_model(tmp_path)
     assert again.frame_names == model.frame_names
     assert again.scene.num_observations == model.scene.num_observations

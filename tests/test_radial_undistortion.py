@@ -177,10 +177,12 @@ def test_the_error_is_told_where_results_are(tmp_path):
         rotation_stddev_deg=np.nan,
         translation_stddev_m=[np.nan] * 3,
     )
-    calibration = SimpleNamespace(covariance=SimpleNamespace(cameras=[unknown] * 2))
     ports = [camera.port for camera in rig.cameras]
-    scene = SimpleNamespace(cam_from_rig=rig.cam_from_rig, ports=ports)
-    entries = housing_summary(SimpleNamespace(rig=rig, scene=scene), calibration)
+    calibration = SimpleNamespace(
+        covariance=SimpleNamespace(cameras=[unknown] * 2),
+        scene=SimpleNamespace(cam_from_rig=rig.cam_from_rig, ports=ports),
+    )
+    entries = housing_summary(rig, calibration)
     keys = "lens_conversion_max_px", "lens_conversion_rms_px"
     found = [tuple(entry[key] for key in keys) for entry in entries]
     converted = right.conversion_max_px, right.conversion_rms_px

@@ -11,11 +11,16 @@ from uwsfm._load_order import refuse_broken_zlib
 
 if TYPE_CHECKING:
     from uwsfm.calibration.bundle_adjustment import calibrate
+    from uwsfm.calibration.error_budget import error_budget
+    from uwsfm.calibration.observability import verdicts
+    from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+    from uwsfm.calibration.uncertainty import predict_covariance
     from uwsfm.colmap import Model
     from uwsfm.errors import InputError, UwsfmError
     from uwsfm.export.files import export_colmap, export_ply, read_model
     from uwsfm.export.housing import export_housing
+    from uwsfm.housing_pipeline import calibrate_housing
     from uwsfm.models.port import FlatPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
@@ -42,6 +47,11 @@ _HOMES = {
     "Status": "uwsfm.models.status",
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
+    "calibrate_housing": "uwsfm.housing_pipeline",
+    "error_budget": "uwsfm.calibration.error_budget",
+    "perspective_adjustment": "uwsfm.calibration.perspective",
+    "predict_covariance": "uwsfm.calibration.uncertainty",
+    "verdicts": "uwsfm.calibration.observability",
     "export_colmap": "uwsfm.export.files",
     "export_housing": "uwsfm.export.housing",
     "export_ply": "uwsfm.export.files",
@@ -62,12 +72,17 @@ __all__ = [
     "Status",
     "UwsfmError",
     "calibrate",
+    "calibrate_housing",
+    "error_budget",
     "export_colmap",
     "export_housing",
     "export_ply",
     "load_rig",
+    "perspective_adjustment",
+    "predict_covariance",
     "read_model",
     "reconstruct",
+    "verdicts",
 ]
 
 

@@ -6,12 +6,17 @@ Heavy packages are imported inside the commands, so that `uwsfm --help` is insta
 import io
 import logging
 import sys
+from collections.abc import Iterable
+from enum import Enum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from uwsfm.errors import InputError, UwsfmError
+
+if TYPE_CHECKING:
+    from uwsfm.housing_pipeline import HousingResult
 
 app = typer.Typer(
     name="uwsfm",
@@ -26,6 +31,15 @@ simulate_app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 
 FAILED, WRONG_INPUT = 1, 2
+
+
+class Refinable(str, Enum):
+    """What --refine takes: the fields refine_... of `CalibrateOptions`."""
+
+    WATER_INDEX = "water-index"
+    FOCAL = "focal"
+    PRINCIPAL_POINT = "principal-point"
+    DISTORTION = "distortion"
 
 
 @app.callback()
@@ -109,6 +123,101 @@ def reconstruct(
         )
     _print_result(result.summary)
     typer.echo(f"results in {out}")
+
+
+@app.command()
+def calibrate(
+    rig: Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IMAGES_OR_MODEL",
+            help="Folder of images, one folder per camera; or a COLMAP model of them.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    strategy: Annotated[
+        Literal["joint", "nested"],
+        typer.Option(help="All at once, or the two loops of the 2011 paper."),
+    ] = "joint",
+    error: Annotated[
+        Literal[
+            "reprojection", "virtual_camera", "virtual_camera_tangential", "point_3d"
+        ]
+        | None,
+        typer.Option(
+            help="What is minimised; default: reprojection, nested: virtual_camera.",
+            show_default=False,
+        ),
+    ] = None,
+    start: Annotated[
+        Literal["virtual", "paper", "pairs"],
+        typer.Option(
+            help="Pinholes fitted to the ports; or adjusted as in the paper, with "
+            "1.333 f and radial distortion; or single stereo pairs, for normals only."
+        ),
+    ] = "virtual",
+    refine: Annotated[
+        list[Refinable] | None,
+        typer.Option(help="Refine this too; may be repeated.", show_default=False),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUE",
+            help="What is known: distance_stddev_m, normal_stddev_deg, "
+            "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
+            "distortion_stddev; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    matcher: Annotated[
+        Literal["colmap", "paper"],
+        typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
+    ] = "colmap",
+    seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
+    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+) -> None:
+    """Calibrate the ports only: housing.yaml, and what the images tell of it."""
+    from uwsfm.console import ProgressBars
+    from uwsfm.housing_pipeline import calibrate_housing
+    from uwsfm.sfm.options import MatchOptions, StartOptions
+
+    wanted = {f"refine_{what.value.replace('-', '_')}": True for what in refine or ()}
+    front_end = StartOptions(
+        matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+    )
+    with ProgressBars() as progress:
+        result = calibrate_housing(
+            rig,
+            source,
+            out,
+            start=start,
+            front_end=front_end,
+            progress=progress,
+            strategy=strategy,
+            error=error,
+            **wanted,
+            **_priors(prior or ()),
+        )
+    _print_housing(result)
+    typer.echo(f"results in {out}")
+
+
+def _priors(texts: Iterable[str]) -> dict[str, float]:
+    """KEY=VALUE, as fields of `CalibrateOptions`."""
+    from uwsfm.calibration.problem import PRIORS
+
+    found = {}
+    for text in texts:
+        key, _, value = text.partition("=")
+        if key not in PRIORS:
+            raise InputError(f"--prior {text}: the key is one of {', '.join(PRIORS)}")
+        try:
+            found[key] = float(value)
+        except ValueError:
+            raise InputError(f"--prior {text}: {value!r} is not a number") from None
+    return found
 
 
 @app.command()
@@ -211,6 +320,18 @@ def _print_result(summary: dict) -> None:
     for warning in summary["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
     console.print(timings_table(summary["timings_s"]))
+
+
+def _print_housing(result: "HousingResult") -> None:
+    from rich.markup import escape
+
+    from uwsfm.console import budget_table, calibration_table, console, housing_table
+
+    console.print(calibration_table(result.summary))
+    console.print(housing_table(result.summary))
+    console.print(budget_table(result.summary))
+    for warning in result.summary["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
 
 
 def main() -> None:

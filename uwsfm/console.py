@@ -97,6 +97,44 @@ def result_table(summary: dict[str, Any]) -> Table:
     return table
 
 
+def calibration_table(summary: dict[str, Any]) -> Table:
+    """What was calibrated from what, and what else was refined."""
+    table = Table(title="Calibration", title_justify="left", show_header=False)
+    table.add_row("strategy, error", f"{summary['strategy']}, {summary['error']}")
+    table.add_row("start", summary["start"])
+    table.add_row(
+        "frames, points", f"{summary['num_registered_frames']}, {summary['num_points']}"
+    )
+    table.add_row("observations", f"{summary['num_observations']}")
+    rms = summary["reprojection_rms_px"]
+    table.add_row("true reprojection RMS", f"{rms:.3f} px")
+    for entry in summary["refined"]:
+        stddev = _number(entry["stddev"], "{:.5g}")
+        table.add_row(Text(entry["name"]), f"{entry['value']:.7g} ± {stddev}")
+    return table
+
+
+def budget_table(summary: dict[str, Any]) -> Table:
+    """What errors of the given numbers would do to the housing."""
+    table = Table(
+        title="If a given number is wrong by so much, in all cameras alike, then",
+        title_justify="left",
+    )
+    table.add_column("given", no_wrap=True)
+    for camera in summary["cameras"]:
+        name = camera["name"]
+        table.add_column(f"{name}\ntilt (deg)", justify="right")
+        table.add_column(f"{name}\ndistance (mm)", justify="right")
+    for row in summary["error_budget"]:
+        cells = []
+        for shift in row["cameras"]:
+            cells.append(_number(shift["tilt_deg"], "{:.3f}"))
+            sign = "" if row is summary["error_budget"][-1] else "+"
+            cells.append(_number(shift["distance_m"], "{:" + sign + ".2f}", 1e3))
+        table.add_row(row["if"], *cells)
+    return table
+
+
 def comparison_table(comparison: Comparison) -> Table:
     """Estimate, standard deviation and truth, side by side."""
     table = Table(title="Estimate against truth", title_justify="left")

@@ -11,6 +11,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from uwsfm._progress import Progress, silent
+from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
@@ -95,14 +96,7 @@ def reconstruct(
         InputError: The rig file, the images or the output folder are not usable.
         UwsfmError: The images could not be reconstructed; the message says why.
     """
-    if not isinstance(rig, Rig):
-        rig = load_rig(rig)
-    for camera, refractive in zip(rig.cameras, rig.refractive_cameras(), strict=True):
-        try:
-            _ = refractive.lens
-        except InputError as error:
-            raise InputError(f"camera {camera.name!r}: {error}") from None
-    out = _output_folder(out)
+    rig, out = checked_rig(rig), output_folder(out)
     options = StartOptions(
         features=FeatureOptions(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)
@@ -112,7 +106,7 @@ def reconstruct(
         num_threads=num_threads,
     )
     find_frames(Path(images), rig)  # wrong folders fail before anything is written
-    with _locked(out):
+    with locked(out):
         return _reconstruct(rig, Path(images), out, options, progress)
 
 
@@ -123,12 +117,12 @@ def _reconstruct(
     timings = dict(start.summary["timings_s"])
     clock = time.perf_counter()
     arrays = read_start(start)
-    refined = refine_scene(_start_scene(rig, start, arrays), rig, progress)
+    refined = refine_scene(start_scene(rig, start, arrays), rig, progress)
     timings["refractive adjustment"] = time.perf_counter() - clock
     clock = time.perf_counter()
     model = _model(rig, images, arrays, refined, progress)
     export_colmap(model, out / SPARSE)
-    export_housing(model, out / HOUSING, refined.calibration)
+    export_housing(model.rig, out / HOUSING, refined.calibration)
     export_ply(model, out / POINTS, refined.calibration.covariance.points)
     timings["colours and export"] = time.perf_counter() - clock
     summary = _summary(model, start, refined, timings)
@@ -141,7 +135,19 @@ def _reconstruct(
     )
 
 
-def _output_folder(out: str | Path) -> Path:
+def checked_rig(rig: Rig | str | Path) -> Rig:
+    """A rig, or that of a rig file, whose lenses can be projected."""
+    if not isinstance(rig, Rig):
+        rig = load_rig(rig)
+    for camera, refractive in zip(rig.cameras, rig.refractive_cameras(), strict=True):
+        try:
+            _ = refractive.lens
+        except InputError as error:
+            raise InputError(f"camera {camera.name!r}: {error}") from None
+    return rig
+
+
+def output_folder(out: str | Path) -> Path:
     """Refuse what would overwrite files that are not ours."""
     out = Path(out)
     if out.exists() and not out.is_dir():
@@ -168,7 +174,7 @@ def _made_by_us(out: Path) -> bool:
 
 
 @contextmanager
-def _locked(out: Path) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Keep a second run out of the folder: both would write the same database."""
     try:
         (out / WORK).mkdir(parents=True, exist_ok=True)
@@ -184,7 +190,7 @@ def _locked(out: Path) -> Iterator[None]:
         lock.release()
 
 
-def _start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:
+def start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:
     placement = start.cam_from_rig
     if rig.cam_from_rig is not None and not rig.refine_cam_from_rig:
         placement = rig.cam_from_rig
@@ -225,10 +231,11 @@ def _summary(
     timings: dict[str, float],
 ) -> dict[str, Any]:
     perspective = dict(start.summary)
-    cameras = housing_summary(model, refined.calibration)
-    warnings = perspective.pop("warnings") + _housing_warnings(cameras, refined)
+    cameras = housing_summary(model.rig, refined.calibration)
+    warnings = perspective.pop("warnings")
+    warnings += housing_warnings(model.rig, refined.calibration)
     del perspective["timings_s"]
-    found = errors_summary(model, refined.calibration)
+    found = errors_summary(refined.calibration)
     after = found.pop("reprojection_rms_px")
     return {
         "num_frames": perspective.pop("num_frames"),
@@ -245,26 +252,9 @@ def _summary(
     }
 
 
-def _housing_warnings(cameras: list[dict], refined: Refined) -> list[str]:
+def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
     """What the images do not tell about the housings, one sentence each."""
-    warnings = []
-    for entry in cameras:
-        verdict = entry["distance_verdict"]
-        if verdict in ("determined", "held"):
-            continue
-        if verdict == "ran into zero":
-            warnings.append(
-                f"the images put the port of {entry['name']} behind its camera, so its "
-                "distance was held at zero: they contradict the lens calibrated in air "
-                "(is it valid up to the image corners?) or the water index"
-            )
-            continue
-        stddev = entry["distance_stddev_m"]
-        known = "unknown" if stddev is None else f"{1e3 * stddev:.1f} mm"
-        warnings.append(
-            f"the port distance of {entry['name']} is {verdict} by these images "
-            f"(standard deviation {known}): add frames at other altitudes, or relief"
-        )
-    if not refined.calibration.summary.converged:
+    warnings = list(verdicts(calibration, [camera.name for camera in rig.cameras]))
+    if not calibration.summary.converged:
         warnings.append("the refractive adjustment stopped before it converged")
     return warnings

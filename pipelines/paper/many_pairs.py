@@ -140,7 +140,7 @@ def solve(task: Task) -> list[Row]:
                 "case": case.name,
                 "noise_px": task.noise_px,
                 "method": method,
-                "normal_deg": normal_errors_deg(result.scene, dive.truth),
+                "normal_deg": normal_errors_deg(result.scene, dive.truth.ports),
                 "normal_bound_deg": [
                     task.noise_px * camera.normal_stddev_deg for camera in unit_bound
                 ],

@@ -16,6 +16,7 @@ from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
+from uwsfm.models.port import FlatPort
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
@@ -46,8 +47,11 @@ def run_all(
     # Spawned: a fork would copy the threads of OpenBLAS and COLMAP half alive.
     context = get_context("spawn")
     with context.Pool(processes, initializer=_one_thread) as pool:
-        results = pool.imap(function, tasks)
-        return list(track(results, label, total=len(tasks), transient=True))
+        running = pool.imap(function, tasks)
+        results = list(track(running, label, total=len(tasks), transient=True))
+        pool.close()
+        pool.join()  # or the workers would be killed, which COLMAP reports at length
+    return results
 
 
 def _one_thread() -> None:
@@ -66,18 +70,24 @@ def warm_up(**options: Any) -> None:
     uwsfm.calibrate(scene, max_iterations=2, **options)
 
 
-def triangulated(scene: Scene) -> Scene:
-    """The scene with its points intersected from the water rays of its ports."""
-    rays = scene.water_rays()
-    points = triangulate_tracks(*rays, scene.point_idx, scene.num_points)
+def straight_ports(scene: Scene, distance_mm: float) -> Scene:
+    """Ports along the optical axes at a distance, points where their rays meet."""
+    cameras = tuple(
+        camera.with_port(
+            replace(camera.port, normal=(0.0, 0.0, 1.0), distance=1e-3 * distance_mm)
+        )
+        for camera in scene.cameras
+    )
+    scene = replace(scene, cameras=cameras)
+    points = triangulate_tracks(*scene.water_rays(), scene.point_idx, scene.num_points)
     return replace(scene, points=points)
 
 
-def normal_errors_deg(found: Scene, truth: Scene) -> list[float]:
+def normal_errors_deg(found: Scene, truth: Sequence[FlatPort]) -> list[float]:
     """Angle between the estimated and the true port normal, per camera."""
     return [
         float(np.degrees(angle_between(port.normal, true.normal)))
-        for port, true in zip(found.ports, truth.ports, strict=True)
+        for port, true in zip(found.ports, truth, strict=True)
     ]
 
 

@@ -1,27 +1,26 @@
 """Figure 6, right, on images: the same with features found, matched and mismatched."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-from monte_carlo import normal_errors_deg, run_all
-from single_pair import DISTANCES_MM, ERRORS, HELD, start
+from monte_carlo import normal_errors_deg, run_all, straight_ports
+from single_pair import DISTANCES_MM, ERRORS, HELD
 from tables import Row, column, select
 
 import uwsfm
+from uwsfm._progress import Progress
 from uwsfm.console import ProgressBars
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.geometry.rigid3 import IDENTITY
-from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.features import extract_features
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.matching import match_features
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
-from uwsfm.sfm.same_frame import PairMatches, read_same_frame_matches
-from uwsfm.simulate.rigs import known_cam_from_rig, nominal_rig, paper_rig
+from uwsfm.sfm.same_frame_scene import same_frame_scene
+from uwsfm.simulate.rigs import nominal_rig, paper_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence
 from uwsfm.simulate.trajectories import rich_motion
 
@@ -45,16 +44,14 @@ def table(
         processes: That share the solves.
         distances_mm: Of both ports, assumed.
     """
-    truth = spec().rig
     images = work / "rendered_pairs"
     with ProgressBars() as progress:
         if not images.exists():
             render_sequence(spec(), images, progress)
-        # The front end sees what a user would write: straight ports at 10 mm.
-        matches = _matches(nominal_rig(truth), images / "images", work, progress)
+        scenes = _scenes(images / "images", work / "rendered_pairs.db", progress)
     tasks = [
         Task(pairs=name, scene=scene, error=error, distance_mm=distance)
-        for name, scene in _scenes(matches, truth).items()
+        for name, scene in scenes.items()
         for error, distance in product(ERRORS, distances_mm)
     ]
     return _summaries(sum(run_all(solve, tasks, processes, "fig. 6, images"), []))
@@ -66,17 +63,18 @@ class Task:
 
     pairs: str
     scene: Scene
-    """With the true ports."""
+    """With the ports that a user would write."""
     error: str
     distance_mm: float
 
 
 def solve(task: Task) -> list[Row]:
-    """The errors of the normals; wrong matches are left to the robust loss."""
-    begin = start(task.scene, task.distance_mm)
-    usable = finite_rows(begin.points)[begin.point_idx]
-    begin, _ = begin.select(usable)
+    """The errors of the normals; what matches remain wrong is left to the loss."""
+    begin = straight_ports(task.scene, task.distance_mm)
+    placed = finite_rows(begin.points)[begin.point_idx]
+    begin, _ = begin.select(placed)
     result = uwsfm.calibrate(begin, error=task.error, **HELD)
+    truth = [item.port for item in spec().rig.cameras]
     return [
         {
             "pairs": task.pairs,
@@ -87,7 +85,7 @@ def solve(task: Task) -> list[Row]:
             "outliers_percent": 100.0 * float(np.mean(~result.inliers)),
             "rms_px": result.summary.rms_px,
         }
-        for angle in normal_errors_deg(result.scene, task.scene)
+        for angle in normal_errors_deg(result.scene, truth)
     ]
 
 
@@ -115,43 +113,16 @@ def _summaries(found: list[Row]) -> list[Row]:
     return rows
 
 
-def _scenes(matches: PairMatches, rig: Rig) -> dict[str, Scene]:
-    scenes = {"all": scene_of(matches, rig)}
-    for frame in np.unique(matches.frame_idx).tolist():
-        scenes[str(frame + 1)] = scene_of(matches, rig, frame)
-    return scenes
+def _scenes(images: Path, database: Path, progress: Progress) -> dict[str, Scene]:
+    """What the front end finds in each pair, and in all of them, the paper's way.
 
-
-def _matches(rig: Rig, images: Path, work: Path, progress) -> PairMatches:
-    """Matches between the two cameras of each frame, by the front end."""
-    frames = find_frames(images, rig)
-    database = work / "rendered_pairs.db"
-    extract_features(frames, rig, database, FeatureOptions(), progress=progress)
-    match_features(frames, database, MatchOptions(), progress=progress)
-    (matches,) = read_same_frame_matches(database, frames, rig)
-    return matches
-
-
-def scene_of(matches: PairMatches, rig: Rig, frame: int | None = None) -> Scene:
-    """Matches of one frame, or of all of them, as if seen in one.
-
-    A known rig is all that relates two observations of a point that no other frame
-    sees, so the frames of a set need no poses.
+    It is told what a user would write: the lenses, the rig, straight ports at 10 mm.
     """
-    chosen = (
-        np.ones(len(matches), bool) if frame is None else matches.frame_idx == frame
-    )
-    count = int(chosen.sum())
-    point = np.repeat(np.arange(count), 2)
-    return Scene.from_arrays(
-        cameras=rig.refractive_cameras(),
-        cam_from_rig=known_cam_from_rig(rig),
-        rig_from_world=IDENTITY[None],
-        points=np.full((count, 3), np.nan),
-        camera_idx=np.tile([matches.camera_a, matches.camera_b], count),
-        frame_idx=np.zeros(2 * count, dtype=np.int64),
-        point_idx=point,
-        xy=np.stack([matches.xy_a[chosen], matches.xy_b[chosen]], axis=1).reshape(
-            -1, 2
-        ),
-    )
+    rig = nominal_rig(spec().rig)
+    frames = find_frames(images, rig)
+    matching = MatchOptions(matcher="paper")
+    extract_features(frames, rig, database, FeatureOptions(), progress=progress)
+    match_features(frames, database, matching, progress=progress)
+    sets = {name: replace(frames, names=(name,)) for name in frames.names}
+    sets["all"] = frames
+    return {name: same_frame_scene(rig, part, database) for name, part in sets.items()}

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from monte_carlo import triangulated
-from rendered_pairs import scene_of
 from single_pair import HELD
 from tables import Row, column, select
 
@@ -18,8 +16,8 @@ from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import WORK, ReconstructResult
 from uwsfm.rig import Rig
 from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.refine import good_observations, within_valid_radius
-from uwsfm.sfm.same_frame import read_same_frame_matches
+from uwsfm.sfm.refine import within_valid_radius
+from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence, reseeded
 from uwsfm.simulate.trajectories import rich_motion
@@ -31,8 +29,6 @@ PAPER_TRIALS_DEG = {
 """Azimuth and tilt as printed in the paper's figure 8."""
 NUM_TANK_SETS = 3
 NUM_RENDERED_SETS, RENDERED_SET_SIZE = 4, 8
-MAX_ERROR_PX = 4.0
-"""Of a match, before the ports are known."""
 
 
 def spec() -> SequenceSpec:
@@ -125,13 +121,13 @@ def _joint_rows(data: str, number: int, result: ReconstructResult) -> list[Row]:
 def _stereo_rows(data: str, number: int, rig: Rig, folder: Path) -> list[Row]:
     """Normals alone from matches within the pairs, as in the paper's figure 8."""
     frames = find_frames(folder / "images", rig)
-    database = folder / "out" / WORK / "database.db"
-    (matches,) = read_same_frame_matches(database, frames, rig)
-    scene = triangulated(scene_of(matches, rig))
-    good = good_observations(scene, MAX_ERROR_PX) & within_valid_radius(scene, rig)
-    counts = np.bincount(scene.point_idx[good], minlength=scene.num_points)
-    scene, _ = scene.select(good & (counts[scene.point_idx] == 2))
-    result = uwsfm.calibrate(scene, **HELD)
+    scene = same_frame_scene(rig, frames, folder / "out" / WORK / "database.db")
+    scene, _ = scene.select(within_valid_radius(scene, rig))
+    # Not yet by their gaps: the ports are guesses. But alone, no ray says anything.
+    scene = without_wrong_matches(scene, max_gaps=np.inf)
+    first = uwsfm.calibrate(scene, **HELD)
+    # Now that the normals are known, a wrong match shows.
+    result = uwsfm.calibrate(without_wrong_matches(first.scene), **HELD)
     return [
         _row(
             data,

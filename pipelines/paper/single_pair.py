@@ -15,20 +15,17 @@ from monte_carlo import (
     rms,
     rms_ratio,
     run_all,
-    triangulated,
+    straight_ports,
     warm_up,
 )
 from tables import Row, column, select
 
 import uwsfm
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.scene import Scene
 from uwsfm.simulate import (
     ObservationOptions,
-    Perturbation,
     Relief,
     SimulatedScene,
-    perturbed,
     simulate_scene,
 )
 from uwsfm.simulate.rigs import paper_rig
@@ -80,8 +77,8 @@ def solve(task: Task) -> list[Row]:
     for distance_mm, error in product(task.distances_mm, task.errors):
         options = {"error": error, "loss": "l2", **HELD}
         warm_up(**options)
-        result = uwsfm.calibrate(start(pair.scene, distance_mm), **options)
-        angles = normal_errors_deg(result.scene, pair.truth)
+        result = uwsfm.calibrate(straight_ports(pair.scene, distance_mm), **options)
+        angles = normal_errors_deg(result.scene, pair.truth.ports)
         for camera, name in enumerate(CAMERAS):
             rows.append(
                 {
@@ -97,12 +94,6 @@ def solve(task: Task) -> list[Row]:
                 }
             )
     return rows
-
-
-def start(scene: Scene, distance_mm: float) -> Scene:
-    """Straight ports at the assumed distance, points where their rays meet."""
-    scale = distance_mm / TRUE_DISTANCE_MM
-    return triangulated(perturbed(scene, Perturbation(distance_scale=scale)))
 
 
 def noise_table(

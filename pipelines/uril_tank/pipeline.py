@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import self_calibrated
 from board import BoardChecks, check_boards, pinhole_rays
-from budget import error_budget, recalibration
+from budget import budget_table, recalibration
 from tank_rig import write_rig
 
 import uwsfm
@@ -103,7 +103,7 @@ def main() -> None:
         f"{pinhole.common_error(result.model):.3f} px, "
         f"self-calibrated {pinhole.common_own_error(result.model):.3f} px\n"
     )
-    print(error_budget(result.model, rig.refine_cam_from_rig))
+    print(budget_table(result.model, rig.refine_cam_from_rig))
     print(f"\n{recalibration(data)}")
 
 

@@ -73,6 +73,7 @@ def calibrate(
         inliers=solved.inliers,
         summary=summary,
         covariance=_covariance(run, solved, summary.sigma_px),
+        options=settings,
     )
 
 

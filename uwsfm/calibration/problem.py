@@ -127,7 +127,8 @@ class CalibrateOptions:
         if self.strategy == "joint" and np.any(self.refine_distances):
             raise InputError(
                 f"error {self.error_name!r} is measured in metres, which a port "
-                "distance shrinks: give refine_distances=False, or strategy='nested'"
+                "distance shrinks: hold the distances (refine_distances=False; refine: "
+                "[normal] in a rig file), or take strategy='nested'"
             )
 
     @property
@@ -267,3 +268,5 @@ class CalibrationResult:
     """(N,) observations that took part in the last solve."""
     summary: CalibrateSummary
     covariance: Covariance
+    options: CalibrateOptions
+    """That were asked for."""

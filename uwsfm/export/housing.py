@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from uwsfm.calibration.observability import distance_verdict
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.colmap import Model
-from uwsfm.export.summary import distance_verdict
+from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
@@ -12,22 +12,22 @@ Standard deviations are one sigma; normals are unit vectors from camera to water
 
 
 def export_housing(
-    model: Model, path: str | Path, calibration: CalibrationResult | None = None
+    rig: Rig, path: str | Path, calibration: CalibrationResult | None = None
 ) -> None:
-    """Write the rig of a model, with standard deviations as comments if known."""
+    """Write a rig, with standard deviations as comments if known."""
     comments = {}
     if calibration is not None:
         comments = {
-            camera.name: _comments(model, calibration, index)
-            for index, camera in enumerate(model.rig.cameras)
+            camera.name: _comments(rig, calibration, index)
+            for index, camera in enumerate(rig.cameras)
         }
-    dump_rig(model.rig, path, HEADER, comments)
+    dump_rig(rig, path, HEADER, comments)
 
 
-def _comments(model: Model, calibration: CalibrationResult, index: int) -> list[str]:
-    camera = model.rig.cameras[index]
+def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
+    camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
-    distance = model.scene.ports[index].distance
+    distance = calibration.scene.ports[index].distance
     lines = []
     if not calibration.covariance.determined:
         return ["the images do not determine this housing: no standard deviations"]

@@ -4,14 +4,20 @@ import importlib.metadata
 import json
 import math
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from uwsfm._files import replaced_file
-from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
-from uwsfm.colmap import Model
+from uwsfm.calibration.error_budget import BudgetRow
+from uwsfm.calibration.observability import distance_verdict, normal_verdict
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.models.lens import param_slots
+from uwsfm.residuals import border
+from uwsfm.rig import Rig
+from uwsfm.solver.layout import HELD
 
 PACKAGES = (
     "uwsfm",
@@ -23,17 +29,17 @@ PACKAGES = (
 )
 
 
-def housing_summary(model: Model, calibration: CalibrationResult) -> list[dict]:
-    """One entry per camera: the estimates, their standard deviations, the verdict.
+def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
+    """One entry per camera: the estimates, their standard deviations, the verdicts.
 
     A standard deviation is null where the value was held, or where the images do not
     determine it; the verdict tells which.
     """
     entries = []
-    for index, camera in enumerate(model.rig.cameras):
+    for index, camera in enumerate(rig.cameras):
         cov = calibration.covariance.cameras[index]
-        pose = model.scene.cam_from_rig[index]
-        port = model.scene.ports[index]
+        pose = calibration.scene.cam_from_rig[index]
+        port = calibration.scene.ports[index]
         entries.append(
             {
                 "name": camera.name,
@@ -43,6 +49,7 @@ def housing_summary(model: Model, calibration: CalibrationResult) -> list[dict]:
                 "normal_stddev_deg": _stddev(
                     cov.normal_stddev_deg, camera.refine_normal
                 ),
+                "normal_verdict": normal_verdict(cov, camera.refine_normal),
                 "distance_m": port.distance,
                 "distance_stddev_m": _stddev(
                     cov.distance_stddev_m,
@@ -70,26 +77,15 @@ def _stddev(value: float, refined: bool) -> float | None:
     return value if refined and math.isfinite(value) else None
 
 
-def distance_verdict(distance: float, cov: CameraCovariance, refined: bool) -> str:
-    """Whether the images determine a port's distance: a word for people."""
-    stddev = cov.distance_stddev_m
-    if not refined:
-        return "held"
-    if cov.distance_at_zero:
-        return "ran into zero"
-    if not math.isfinite(stddev) or stddev >= abs(distance):
-        return "not determined"
-    return "determined" if stddev < 0.25 * abs(distance) else "weakly determined"
-
-
-def errors_summary(model: Model, calibration: CalibrationResult) -> dict[str, Any]:
-    """Counts and true reprojection errors."""
+def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
+    """Counts and true reprojection errors, of the observations that were used."""
     summary = calibration.summary
-    errors = model.errors_px()
+    scene, _ = calibration.scene.select(calibration.inliers)
+    errors = np.linalg.norm(scene.residuals(), axis=1)
     return {
-        "num_registered_frames": model.scene.num_frames,
-        "num_points": model.scene.num_points,
-        "num_observations": model.scene.num_observations,
+        "num_registered_frames": calibration.scene.num_frames,
+        "num_points": scene.num_points,
+        "num_observations": scene.num_observations,
         "num_invalid": int(np.count_nonzero(~np.isfinite(errors))),
         "reprojection_rms_px": float(np.sqrt(np.nanmean(errors**2))),
         "reprojection_mean_px": float(np.nanmean(errors)),
@@ -98,6 +94,48 @@ def errors_summary(model: Model, calibration: CalibrationResult) -> dict[str, An
         "solver_converged": summary.converged,
         "housing_determined": calibration.covariance.determined,
     }
+
+
+def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, Any]]:
+    """Estimates beside ports and placement: water, baselines, lenses."""
+    covariance, scene = calibration.covariance, calibration.scene
+    stddevs = np.sqrt(np.append(np.diag(covariance.border), np.nan))
+    entries = []
+
+    def add(name: str, camera: int, slot: int, value: float) -> None:
+        column = int(covariance.border_cols[camera, slot])
+        if column != HELD:
+            stddev = _stddev(float(stddevs[column]), True)
+            entries.append({"name": name, "value": value, "stddev": stddev})
+
+    add("water index", 0, border.WATER_INDEX, scene.ports[0].n_water)
+    for c, item in enumerate(rig.cameras):
+        length = float(np.linalg.norm(scene.cam_from_rig[c, 4:]))
+        add(f"baseline of {item.name} (m)", c, border.LENGTH, length)
+        lens = scene.cameras[c].camera
+        names = item.camera.params_info.split(", ")
+        slots = param_slots(lens.model_name)
+        for name, slot, value in zip(names, slots, lens.params, strict=True):
+            text = f"{name} of {item.name}"
+            add(text, c, border.FIRST_LENS + slot, float(value))
+    return entries
+
+
+def budget_summary(rows: Sequence[BudgetRow]) -> list[dict[str, Any]]:
+    """What errors of the given numbers would do; null if that is not determined."""
+    return [
+        {
+            "if": row.name,
+            "cameras": [
+                {
+                    "tilt_deg": _stddev(shift.tilt_deg, True),
+                    "distance_m": _stddev(shift.distance_m, True),
+                }
+                for shift in row.shifts
+            ],
+        }
+        for row in rows
+    ]
 
 
 def versions() -> dict[str, str]:

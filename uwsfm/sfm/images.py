@@ -63,12 +63,12 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts], name
 
 
-def find_frames(image_dir: Path, rig: Rig) -> Frames:
+def find_frames(image_dir: Path, rig: Rig, min_num_frames: int = MIN_FRAMES) -> Frames:
     """Pair the images of the rig's folders by equal file name.
 
     Raises:
         InputError: a folder that is missing or holds no image, no common name, fewer
-            than two frames, or a file name that contains white space.
+            frames than ``min_num_frames``, or a file name that contains white space.
     """
     image_dir = Path(image_dir)
     if not image_dir.is_dir():
@@ -83,10 +83,10 @@ def find_frames(image_dir: Path, rig: Rig) -> Frames:
             f"{first} has {min(found[first])}, {second} has {min(found[second])}; "
             "images of one frame must have equal names"
         )
-    if len(common) < MIN_FRAMES:
+    if len(common) < min_num_frames:
         raise InputError(
             f"only one frame ({common.pop()}) has an image of every camera in "
-            f"{image_dir}; a reconstruction needs at least {MIN_FRAMES}"
+            f"{image_dir}; a reconstruction needs at least {min_num_frames}"
         )
     frames = Frames(
         image_dir=image_dir,

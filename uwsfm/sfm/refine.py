@@ -1,6 +1,7 @@
 """From the perspective start to the refractive optimum."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,19 @@ class Refined:
     """True error of the kept observations before the first solve, px."""
 
 
-def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined:
+def rig_options(rig: Rig) -> dict[str, Any]:
+    """What a rig file says of the calibration, as fields of `CalibrateOptions`."""
+    return {
+        "refine_normals": tuple(camera.refine_normal for camera in rig.cameras),
+        "refine_distances": tuple(camera.refine_distance for camera in rig.cameras),
+        "refine_cam_from_rig": rig.refine_cam_from_rig,
+        "baseline_stddev_m": rig.baseline_stddev_m,
+    }
+
+
+def refine_scene(
+    scene: Scene, rig: Rig, progress: Progress = silent, **options: Any
+) -> Refined:
     """Refractive bundle adjustment, twice: the second with all tracks tested again.
 
     Points are triangulated from the water rays before each solve, so that a pinhole's
@@ -47,16 +60,12 @@ def refine_scene(scene: Scene, rig: Rig, progress: Progress = silent) -> Refined
             perspective start; its points are not used.
         rig: what to refine, and how well the baseline is known.
         progress: called as the solver iterates.
+        **options: further fields of `CalibrateOptions`.
 
     Raises:
         UwsfmError: nothing is left to adjust, or the result is not physical.
     """
-    options = {
-        "refine_normals": tuple(camera.refine_normal for camera in rig.cameras),
-        "refine_distances": tuple(camera.refine_distance for camera in rig.cameras),
-        "refine_cam_from_rig": rig.refine_cam_from_rig,
-        "baseline_stddev_m": rig.baseline_stddev_m,
-    }
+    options = {**rig_options(rig), **options}
     steps = 0
 
     def report(iteration: int, cost: float) -> None:

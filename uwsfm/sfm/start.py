@@ -102,7 +102,7 @@ def perspective_start(
     options = options or StartOptions()
     frames = find_frames(Path(image_dir), rig)
     steps, space = Steps(Path(work_dir)), Workspace(work_dir=Path(work_dir))
-    key = _match_images(rig, frames, steps, space, options, progress)
+    key = match_images(rig, frames, steps, space, options, progress)
     return start_from_matches(rig, frames, steps, key, options, progress)
 
 
@@ -173,7 +173,7 @@ def _loaded(space: Workspace, frames: Frames, steps: Steps) -> PerspectiveStart:
     return start
 
 
-def _match_images(
+def match_images(
     rig: Rig,
     frames: Frames,
     steps: Steps,
@@ -181,7 +181,10 @@ def _match_images(
     options: StartOptions,
     progress: Progress,
 ) -> str:
-    """Features and raw matches; neither depends on lenses, ports or poses."""
+    """Features and raw matches, in the workspace's database; their fingerprint.
+
+    Neither depends on lenses, ports or poses.
+    """
     sizes = sorted([c.images, c.camera.width, c.camera.height] for c in rig.cameras)
     inputs = [
         [version("uwsfm"), pycolmap.__version__],

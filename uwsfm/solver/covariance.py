@@ -47,7 +47,7 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
     The observations' noise is taken as 1 px: multiply by the noise variance.
     """
     matrix, _, inverses = schur.reduced_system(layout, eqs, 0.0)
-    inverse = _inverse_of_lower(matrix)
+    inverse = inverse_of_lower(matrix)
     if inverse is None:
         return ReducedCovariance(
             matrix=np.full_like(matrix, np.nan), determined=False, inverses=inverses
@@ -55,7 +55,7 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
     return ReducedCovariance(matrix=inverse, determined=True, inverses=inverses)
 
 
-def _inverse_of_lower(matrix: Array) -> Array | None:
+def inverse_of_lower(matrix: Array) -> Array | None:
     """Inverse of a symmetric matrix by Cholesky; None if it is singular.
 
     Args:

@@ -1,0 +1,164 @@
+"""`uwsfm calibrate`: from a model, from one pair of images, and its refusals."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sfm_scenes import model_of
+
+import uwsfm
+from uwsfm.demo import sample_dir
+from uwsfm.export.files import export_colmap
+from uwsfm.geometry import unit_vector
+from uwsfm.housing_pipeline import CALIBRATION, calibrate_housing
+from uwsfm.rig_file import dump_rig
+from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
+from uwsfm.simulate.trajectories import rich_motion
+
+NOISE_PX = 0.3
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    """A COLMAP model as a pinhole program leaves it: no ports, and off in scale."""
+    folder = tmp_path_factory.mktemp("dive")
+    options = ObservationOptions(num_points=400, noise_px=NOISE_PX, outlier_ratio=0.02)
+    simulated = simulate_scene(
+        sample_rig(), rich_motion(10), Relief(stddev=0.2), options
+    )
+    start = perturbed(simulated.scene)
+    scaled = {
+        name: np.hstack([poses[:, :4], 3.0 * poses[:, 4:]])
+        for name in ("cam_from_rig", "rig_from_world")
+        for poses in (getattr(start, name),)
+    }
+    start = replace(start, points=3.0 * start.points, **scaled)
+    rig = nominal_rig(sample_rig())
+    export_colmap(model_of(rig, start), folder / "sparse" / "0")
+    dump_rig(rig, folder / "rig.yaml", "a rig")
+    return folder, simulated.truth
+
+
+def assert_within_stddevs(result, truth, sigmas=4.0):
+    for camera, port, true_port in zip(
+        result.calibration.covariance.cameras,
+        result.calibration.scene.ports,
+        truth.ports,
+        strict=True,
+    ):
+        angle = np.degrees(unit_vector.angle_between(port.normal, true_port.normal))
+        assert angle < sigmas * camera.normal_stddev_deg
+        gap = abs(port.distance - true_port.distance)
+        assert gap <= sigmas * camera.distance_stddev_m
+
+
+@pytest.mark.parametrize("strategy", ["joint", "nested"])
+@pytest.mark.parametrize("start", ["virtual", "paper"])
+def test_a_colmap_model_gives_the_housing(dive, tmp_path, strategy, start):
+    folder, truth = dive
+    result = calibrate_housing(
+        folder / "rig.yaml", folder, tmp_path, strategy=strategy, start=start
+    )
+    assert_within_stddevs(result, truth)
+    # The scale is that of the rig file, not of the model.
+    assert result.rig.baseline_m == pytest.approx(0.2, rel=1e-9)
+    assert uwsfm.load_rig(tmp_path / "housing.yaml").cameras[0].port.distance > 0.015
+    found = json.loads((tmp_path / CALIBRATION).read_text())
+    assert (found["strategy"], found["start"]) == (strategy, start)
+    # 3800 observations tell their noise to 1.5 %; pruning at 3.5 takes 0.7 %.
+    assert found["sigma_px"] == pytest.approx(NOISE_PX, rel=0.05)
+    assert len(found["error_budget"]) == 8
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"housing.yaml", CALIBRATION, "uwsfm-work"}
+
+
+def test_refined_water_and_lenses_arrive_in_the_housing(dive, tmp_path):
+    folder, _ = dive
+    result = calibrate_housing(
+        folder / "rig.yaml",
+        folder / "sparse" / "0",
+        tmp_path,
+        refine_water_index=True,
+        refine_focal=True,
+        focal_stddev=1e-3,
+    )
+    back = uwsfm.load_rig(tmp_path / "housing.yaml")
+    lens = result.calibration.scene.cameras[0].camera
+    assert back.cameras[0].camera.params == pytest.approx(lens.params, rel=1e-9)
+    port = result.calibration.scene.ports[0]
+    assert back.cameras[0].port.n_water == pytest.approx(port.n_water, rel=1e-9)
+    entries = {entry["name"]: entry for entry in result.summary["refined"]}
+    water = entries["water index"]
+    assert abs(water["value"] - 1.333) < 4.0 * water["stddev"]
+    assert {"fx of left", "fy of left", "fx of right", "fy of right"} < set(entries)
+
+
+@pytest.fixture(scope="module")
+def one_pair(tmp_path_factory) -> Path:
+    """The first pair of the rendered sample."""
+    folder, sample = tmp_path_factory.mktemp("pair"), sample_dir()
+    name = min(path.name for path in (sample / "images" / "left").iterdir())
+    for side in ("left", "right"):
+        (folder / "images" / side).mkdir(parents=True)
+        shutil.copy(sample / "images" / side / name, folder / "images" / side)
+    return folder
+
+
+def test_one_pair_gives_normals_if_the_distances_are_given(one_pair, tmp_path):
+    sample = uwsfm.load_rig(sample_dir() / "rig.yaml")
+    truth = sample_rig()
+    known = tuple(
+        replace(camera, refine_distance=False, port=replace(camera.port, distance=0.02))
+        for camera in sample.cameras
+    )
+    rig = replace(sample, cameras=known)
+    result = calibrate_housing(rig, one_pair / "images", tmp_path)
+    assert result.summary["start"] == "pairs"
+    for port, item in zip(result.calibration.scene.ports, truth.cameras, strict=True):
+        assert port.distance == 0.02
+        angle = unit_vector.angle_between(port.normal, item.port.normal)
+        # 0.026 degrees of noise, and SIFT's own bias of a few hundredths.
+        assert np.degrees(angle) < 0.1
+    verdicts = {camera["distance_verdict"] for camera in result.summary["cameras"]}
+    assert verdicts == {"held"}
+
+
+def test_one_pair_is_not_asked_for_a_distance(one_pair, tmp_path):
+    with pytest.raises(
+        uwsfm.InputError, match="from one stereo pair, because for every"
+    ):
+        calibrate_housing(sample_dir() / "rig.yaml", one_pair / "images", tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"start": "somewhere"}, "start must be one of virtual, paper, pairs"),
+        ({"start": "pairs"}, "is a model"),
+        ({"strategy": "staged"}, "strategy must be one of joint, nested"),
+        ({"error": "virtual_camera"}, "hold the distances"),
+        ({"error": "point_3d", "refine_focal": True}, "needs the reprojection error"),
+        ({"focal_stddev": -1.0}, "focal_stddev must be positive"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_anything_is_written(
+    dive, tmp_path, how, words
+):
+    folder, _ = dive
+    with pytest.raises(uwsfm.InputError, match=words):
+        calibrate_housing(folder / "rig.yaml", folder, tmp_path, **how)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_reconstruction_is_not_given_another_housing(dive, tmp_path):
+    folder, _ = dive
+    (tmp_path / "uwsfm-work").mkdir()
+    (tmp_path / "uwsfm-work" / "lock").touch()
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(uwsfm.InputError, match="holds a reconstruction"):
+        calibrate_housing(folder / "rig.yaml", folder, tmp_path)

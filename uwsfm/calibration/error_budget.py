@@ -1,0 +1,160 @@
+"""What errors of the given numbers would do to the estimates, without solving again.
+
+The gradient g(x, p) vanishes at the optimum, so a given number p that is off by dp
+moves the estimate x by dx = -H_xx^-1 H_xp dp: one linearisation answers for all.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uwsfm.calibration.priors import border_priors
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.uncertainty import likelihood
+from uwsfm.geometry import unit_vector
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.residuals import border
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver import schur
+from uwsfm.solver.covariance import inverse_of_lower
+from uwsfm.solver.layout import HELD, build_layout
+from uwsfm.solver.levenberg_marquardt import suitable_blas
+from uwsfm.solver.state import State
+
+FOCAL, CX, CY = border.FIRST_LENS, border.FIRST_LENS + 2, border.FIRST_LENS + 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shift:
+    """How the estimates of one camera would move."""
+
+    distance_m: float
+    normal: tuple[float, float, float]
+    """Change of the port normal; its length is the angle in radians."""
+
+    @property
+    def tilt_deg(self) -> float:
+        return float(np.degrees(np.linalg.norm(self.normal)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetRow:
+    """One given number, wrong by so much in all cameras alike."""
+
+    name: str
+    shifts: tuple[Shift, ...]
+    """One per camera."""
+
+
+def error_budget(scene: Scene, **options: Any) -> tuple[BudgetRow, ...]:
+    """Shifts of all ports for a standard set of errors, by linear propagation.
+
+    A number that is refined without a prior shifts nothing; with one, its prior is what
+    is taken to be wrong. The last row is the root of the sum of squares of the others:
+    lengths of shifts, whose signs are lost.
+
+    Args:
+        scene: at its optimum, with the observations that were used only.
+        **options: fields of `CalibrateOptions`, as for the calibration.
+
+    Returns:
+        One row per error; NaN if the observations do not determine the estimates.
+
+    Raises:
+        InputError: an unknown option.
+    """
+    settings = CalibrateOptions.parsed(options)
+    changes = _standard_changes(scene)
+    models = [camera.camera.model_name for camera in scene.cameras]
+    at_zero = np.array([port.distance == 0.0 for port in scene.ports])
+    columns = settings.border_columns(models, at_zero)
+    moved = _propagate(scene, settings, columns, np.stack(list(changes.values())))
+    rows = [
+        BudgetRow(name=name, shifts=_shifts(scene, step))
+        for name, step in zip(changes, moved, strict=True)
+    ]
+    total = tuple(
+        Shift(
+            distance_m=float(np.sqrt(sum(r.shifts[c].distance_m ** 2 for r in rows))),
+            normal=_root_sum([r.shifts[c].normal for r in rows]),
+        )
+        for c in range(len(scene.cameras))
+    )
+    return (*rows, BudgetRow(name="all of these together", shifts=total))
+
+
+def _root_sum(vectors: list[tuple[float, float, float]]) -> tuple[float, float, float]:
+    x, y, z = np.sqrt(np.sum(np.square(vectors), axis=0)).tolist()
+    return x, y, z
+
+
+def _standard_changes(scene: Scene) -> dict[str, Array]:
+    """Errors worth knowing about, as steps of the border (C, BORDER_SIZE)."""
+    lenses = np.array([camera.lens for camera in scene.cameras])
+    nothing = np.zeros((len(scene.cameras), border.BORDER_SIZE))
+
+    def change(slots: Any, amount: Any) -> Array:
+        step = nothing.copy()
+        step[:, slots] = amount
+        return step
+
+    lengths = np.linalg.norm(scene.cam_from_rig[:, 4:], axis=1)
+    return {
+        "focal length +0.1 %": change([FOCAL, FOCAL + 1], 1e-3 * lenses[:, :2]),
+        "principal point +1 px in x": change(CX, 1.0),
+        "principal point +1 px in y": change(CY, 1.0),
+        "water index +0.01": change(border.WATER_INDEX, 0.01),
+        "glass index +0.01": change(border.GLASS_INDEX, 0.01),
+        "glass thickness +2 mm": change(border.THICKNESS, 2e-3),
+        "baseline +1 %": change(border.LENGTH, 0.01 * lengths),
+    }
+
+
+def _propagate(
+    scene: Scene, settings: CalibrateOptions, columns: IndexArray, changes: Array
+) -> Array:
+    """Steps (E, C, BORDER_SIZE) of the border for changes (E, C, BORDER_SIZE)."""
+    given = (columns == HELD) & np.any(changes != 0.0, axis=0)
+    num_free = int(columns.max(initial=-1)) + 1
+    extended = columns.copy()
+    extended[given] = num_free + np.arange(np.count_nonzero(given))
+    layout = build_layout(scene, extended)
+    state = State.from_scene(scene)
+    sigma = _sigma(scene, layout.num_frame_cols + num_free)
+    priors = border_priors(scene, settings, columns, sigma)
+    with suitable_blas(layout):
+        eqs = likelihood(layout, state, priors)
+        lower, _, _ = schur.reduced_system(layout, eqs, 0.0)
+        # The order of the border is that of the columns: the given ones come last.
+        split = layout.num_frame_cols + num_free
+        coupling = lower[split:, :split]
+        inverse = inverse_of_lower(np.ascontiguousarray(lower[:split, :split]))
+    steps = np.full(changes.shape, np.nan)
+    if inverse is None:
+        return steps
+    right = -changes[:, given] @ coupling
+    if priors is not None:
+        known = (priors.weights > 0.0) & (columns != HELD)
+        pulled = changes[:, known] * priors.weights[known]
+        np.add.at(right.T, layout.num_frame_cols + columns[known], pulled.T)
+    border_steps = (right @ inverse)[:, layout.num_frame_cols :]
+    padded = np.concatenate([border_steps, np.zeros((len(changes), 1))], axis=1)
+    return padded[:, columns]  # HELD = -1 reads the zeros at the end
+
+
+def _sigma(scene: Scene, num_unknowns: int) -> float:
+    """Noise of one coordinate at an optimum, px."""
+    squares = np.nansum(scene.residuals() ** 2)
+    count = 2 * scene.num_observations - num_unknowns - 3 * scene.num_points
+    return max(float(np.sqrt(squares / max(count, 1))), 1e-9)
+
+
+def _shifts(scene: Scene, step: Array) -> tuple[Shift, ...]:
+    shifts = []
+    for camera, row in zip(scene.cameras, step, strict=True):
+        turn = unit_vector.tangent_basis(camera.port.normal) @ row[border.NORMAL]
+        x, y, z = turn.tolist()
+        distance = float(row[border.DISTANCE])
+        shifts.append(Shift(distance_m=distance, normal=(x, y, z)))
+    return tuple(shifts)

@@ -1,0 +1,230 @@
+"""What the images determine and what they do not, in words, and what to do about it.
+
+Scale, distance and depth hang together under water: which combinations stay open
+follows from the posterior covariance, and why from how the rig moved over what.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import finite_rows
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.residuals import border
+from uwsfm.scene import Scene
+from uwsfm.solver.layout import HELD
+
+# A standard deviation below this share of a distance is worth a number.
+WEAK_SHARE = 0.25
+# Tilts better than this can be told from a straight port by eye.
+WEAK_TILT_DEG, OPEN_TILT_DEG = 0.2, 1.0
+# Below this, relief and changes of range do not separate depth from port distance.
+FLAT, LEVEL = 0.03, 0.15
+FEW_FRAMES = 5
+INSEPARABLE = 0.95
+
+
+def distance_verdict(distance: float, cov: CameraCovariance, refined: bool) -> str:
+    """Whether the images determine a port's distance: a word for people."""
+    if not refined:
+        return "held"
+    if cov.distance_at_zero:
+        return "ran into zero"
+    return _verdict(cov.distance_stddev_m, WEAK_SHARE * abs(distance), abs(distance))
+
+
+def normal_verdict(cov: CameraCovariance, refined: bool) -> str:
+    """Whether the images determine a port's tilt: a word for people."""
+    if not refined:
+        return "held"
+    return _verdict(cov.normal_stddev_deg, WEAK_TILT_DEG, OPEN_TILT_DEG)
+
+
+def _verdict(stddev: float, weak: float, lost: float) -> str:
+    if not math.isfinite(stddev) or stddev >= lost:
+        return "not determined"
+    return "determined" if stddev < weak else "weakly determined"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """How the rig moved over what; lengths relative to the median range."""
+
+    num_frames: int
+    relief: float
+    """Standard deviation of the points from their plane."""
+    range_spread: float
+    """Of the frames' median ranges, from the 5th to the 95th percentile."""
+
+    @classmethod
+    def of(cls, scene: Scene) -> "Geometry":
+        used = finite_rows(scene.points)[scene.point_idx]
+        frames, points = scene.frame_idx[used], scene.points[scene.point_idx[used]]
+        depth = rigid3.transform(scene.rig_from_world[frames], points)[:, 2]
+        seen = np.unique(frames)
+        ranges = np.array([np.median(depth[frames == f]) for f in seen])
+        cloud = scene.points[finite_rows(scene.points)]
+        flat = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)[-1]
+        low, high = np.percentile(ranges, [5.0, 95.0])
+        middle = float(np.median(ranges))
+        return cls(
+            num_frames=len(seen),
+            relief=float(flat / np.sqrt(len(cloud)) / middle),
+            range_spread=float((high - low) / middle),
+        )
+
+    def reason(self) -> tuple[str, str]:
+        """What makes a distance hard to tell here, and what would help."""
+        if self.num_frames < FEW_FRAMES:
+            return f"only {self.num_frames} frames", "add frames"
+        if self.relief >= FLAT and self.range_spread >= LEVEL:
+            return (
+                f"these {self.num_frames} frames",
+                "add frames, turned and tilted against each other",
+            )
+        if self.relief >= FLAT:
+            return "a rig at constant altitude", "fly at two altitudes"
+        if self.range_spread >= LEVEL:
+            return "a flat sea floor", "add frames, or fly over relief"
+        return "a flat sea floor at constant altitude", "fly at two altitudes"
+
+
+def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]:
+    """One sentence for everything refined that the images do not determine.
+
+    Args:
+        result: of a calibration, with its covariance.
+        names: of its cameras.
+
+    Returns:
+        Nothing if all is determined.
+    """
+    covariance = result.covariance
+    geometry = Geometry.of(result.scene.select(result.inliers)[0])
+    at_zero = tuple(
+        f"the images put the port of {name} behind its camera, so its distance was "
+        "held at zero: either they do not determine it, or they contradict the lens "
+        "calibrated in air (is it valid up to the image corners?) or the water index"
+        for name, camera in zip(names, covariance.cameras, strict=True)
+        if camera.distance_at_zero
+    )
+    if not covariance.determined:
+        reason, advice = geometry.reason()
+        return (
+            *at_zero,
+            "the images leave some combination of what is refined entirely free, so no "
+            f"standard deviation can be given; {reason} do not tell: {advice}, or hold "
+            "more of it",
+        )
+    return (
+        *at_zero,
+        *_distances(result, names, geometry),
+        *_tilts(result, names),
+        *_inseparable(result, names),
+    )
+
+
+def _distances(
+    result: CalibrationResult, names: Sequence[str], geometry: Geometry
+) -> list[str]:
+    """The weak directions of the port distances, weakest first."""
+    covariance = result.covariance
+    cols = covariance.border_cols[:, border.DISTANCE]
+    free = np.nonzero(cols != HELD)[0]
+    if not len(free):
+        return []
+    block = covariance.border[np.ix_(cols[free], cols[free])]
+    # Neighbours' shared errors make the reported deviations larger than the block's.
+    reported = np.array([covariance.cameras[c].distance_stddev_m for c in free])
+    grow = reported / np.sqrt(np.diag(block))
+    values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
+    typical = float(np.mean([result.scene.ports[c].distance for c in free]))
+    sentences = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        # Of one distance, not of the unit vector that several share.
+        share = np.abs(vector[_strong(vector)]).mean()
+        stddev = float(share * np.sqrt(max(value, 0.0)))
+        word = _verdict(stddev, WEAK_SHARE * typical, typical)
+        if word == "determined":
+            continue
+        reason, advice = geometry.reason()
+        what = _direction(vector, [names[int(c)] for c in free])
+        sentences.append(
+            f"{what} is {word} by {reason}: standard deviation {1e3 * stddev:.1f} mm; "
+            f"{advice}"
+        )
+    return sentences
+
+
+def _strong(vector: Array) -> NDArray[np.bool_]:
+    return np.abs(vector) > 0.5 * np.abs(vector).max()
+
+
+def _direction(vector: Array, names: list[str]) -> str:
+    """What a direction in the space of distances is called."""
+    strong = _strong(vector)
+    if np.count_nonzero(strong) == 1:
+        return f"the distance of the port of {names[int(np.argmax(np.abs(vector)))]}"
+    some = [name for name, on in zip(names, strong, strict=True) if on]
+    which = "both ports" if len(names) == 2 else f"the ports of {', '.join(some)}"
+    if len(some) == len(names) > 2:
+        which = "all ports"
+    same = np.all(vector[strong] > 0.0) or np.all(vector[strong] < 0.0)
+    return f"the common distance of {which}" if same else f"the distances of {which}"
+
+
+def _tilts(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+    sentences = []
+    for c, camera in enumerate(result.covariance.cameras):
+        refined = bool(result.covariance.border_cols[c, border.NORMAL][0] != HELD)
+        word = normal_verdict(camera, refined)
+        if word in ("weakly determined", "not determined"):
+            sentences.append(
+                f"the tilt of the port of {names[c]} is {word}: standard deviation "
+                f"{camera.normal_stddev_deg:.2f} deg; more points or frames would help"
+            )
+    return sentences
+
+
+def _inseparable(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+    """Pairs of unlike numbers that the images hardly tell apart."""
+    columns, labels = _labels(result, names)
+    block = result.covariance.border[np.ix_(columns, columns)]
+    spread = np.sqrt(np.diag(block))
+    correlation = block / np.outer(spread, spread)
+    sentences = []
+    for j in range(len(columns)):
+        for i in range(j):
+            value = float(correlation[i, j])
+            if labels[i][0] != labels[j][0] and abs(value) > INSEPARABLE:
+                sentences.append(
+                    f"{labels[i][1]} and {labels[j][1]} can hardly be told apart "
+                    f"(correlation {value:+.2f}): give a prior for one of them"
+                )
+    return sentences
+
+
+def _labels(
+    result: CalibrationResult, names: Sequence[str]
+) -> tuple[list[int], list[tuple[str, str]]]:
+    """Columns of the numbers that may be confused, with a kind and a name each."""
+    kinds = {
+        border.DISTANCE: "the port distance of {}",
+        border.WATER_INDEX: "the water index",
+        border.LENGTH: "the baseline of {}",
+        border.FIRST_LENS: "the focal length of {}",
+    }
+    columns: list[int] = []
+    labels: list[tuple[str, str]] = []
+    for c, name in enumerate(names):
+        for slot, text in kinds.items():
+            column = int(result.covariance.border_cols[c, slot])
+            if column != HELD and column not in columns:
+                columns.append(column)
+                labels.append((text, text.format(name)))
+    return columns, labels

@@ -1,0 +1,235 @@
+"""Housing calibration from images or from a COLMAP model: the housing, and no cloud."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from uwsfm._progress import Progress, silent
+from uwsfm.calibration.bundle_adjustment import calibrate
+from uwsfm.calibration.error_budget import BudgetRow, error_budget
+from uwsfm.calibration.perspective import perspective_adjustment
+from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.colmap import from_reconstruction, read_reconstruction
+from uwsfm.errors import InputError
+from uwsfm.export.files import HOUSING, SPARSE
+from uwsfm.export.housing import export_housing
+from uwsfm.export.summary import (
+    budget_summary,
+    errors_summary,
+    housing_summary,
+    refined_summary,
+    versions,
+    write_json,
+)
+from uwsfm.pipeline import (
+    WORK,
+    checked_rig,
+    housing_warnings,
+    locked,
+    output_folder,
+    start_scene,
+)
+from uwsfm.rig import Rig
+from uwsfm.scene import Scene
+from uwsfm.sfm.images import find_frames
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.perspective import read_start
+from uwsfm.sfm.refine import refine_scene, rig_options
+from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
+from uwsfm.sfm.start import Workspace, match_images, perspective_start
+from uwsfm.sfm.steps import Steps
+
+Start = Literal["virtual", "paper", "pairs"]
+
+CALIBRATION = "calibration.json"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HousingResult:
+    """A calibrated housing; the same is on disk."""
+
+    rig: Rig
+    calibration: CalibrationResult
+    budget: tuple[BudgetRow, ...]
+    """What errors of the given numbers would do to it."""
+    summary: dict[str, Any]
+    """calibration.json"""
+
+
+def calibrate_housing(
+    rig: Rig | str | Path,
+    source: str | Path,
+    out: str | Path,
+    *,
+    start: Start = "virtual",
+    front_end: StartOptions | None = None,
+    progress: Progress = silent,
+    **options: Any,
+) -> HousingResult:
+    """Calibrate the ports of a rig from images, or from a COLMAP model of them.
+
+    Args:
+        rig: a rig, or the path of a rig file; its ports are the initial values.
+        source: folder of images as for `reconstruct`, a COLMAP model whose images are
+            in the rig's folders, or the output folder of `reconstruct`.
+        out: receives ``housing.yaml`` and ``calibration.json``.
+        start: "virtual": pinholes fitted to the initial ports; "paper": adjusted with
+            pinholes of 1.333 f and radial distortion besides (section 3.2.2);
+            "pairs": matches between the cameras of one frame only, with rig and
+            distances as given (section 3.2.1). One frame alone is "pairs".
+        front_end: how features are found and matched.
+        progress: called with each long step.
+        **options: fields of `CalibrateOptions`.
+
+    Raises:
+        InputError: the rig, the source, an option or the output folder is not usable;
+            or a port distance is asked of single stereo pairs.
+        UwsfmError: the images could not be reconstructed; the message says why.
+    """
+    rig = checked_rig(rig)
+    if start not in get_args(Start):
+        raise InputError(
+            f"start must be one of {', '.join(get_args(Start))}, got {start!r}"
+        )
+    merged = {**rig_options(rig), **options}
+    CalibrateOptions.parsed(merged)  # a wrong option fails before anything is written
+    source, out = Path(source), output_folder(out)
+    if (out / SPARSE).exists():
+        raise InputError(
+            f"{out} holds a reconstruction, whose housing this would replace: choose "
+            "another folder"
+        )
+    model = _model_folder(source)
+    job = _Job(rig, source, out, start, front_end or StartOptions(), progress, merged)
+    if model is None:
+        frames = find_frames(source, rig, min_num_frames=1)
+        if start == "pairs" or len(frames.names) == 1:
+            _require_distances_held(rig, merged, len(frames.names))
+            job = replace(job, start="pairs")
+    elif start == "pairs":
+        raise InputError(f"{source} is a model: start 'pairs' works from images")
+    with locked(out):
+        return job.run(model)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One calibration, its input and how it is to be done."""
+
+    rig: Rig
+    source: Path
+    out: Path
+    start: Start
+    front_end: StartOptions
+    progress: Progress
+    options: Mapping[str, Any]
+
+    def run(self, model: Path | None) -> HousingResult:
+        if self.start == "pairs":
+            calibration = self._from_pairs()
+        else:
+            scene = self._from_images() if model is None else self._from_model(model)
+            if self.start == "paper":
+                scene, _ = perspective_adjustment(scene, loss="cauchy")
+            options = dict(self.options)
+            calibration = refine_scene(
+                scene, self.rig, self.progress, **options
+            ).calibration
+        return self._finish(calibration)
+
+    def _from_images(self) -> Scene:
+        start = perspective_start(
+            self.rig, self.source, self.out / WORK, self.front_end, self.progress
+        )
+        return start_scene(self.rig, start, read_start(start))
+
+    def _from_model(self, folder: Path) -> Scene:
+        """The model's poses and tracks, scaled to the rig's baseline."""
+        scene = from_reconstruction(read_reconstruction(folder), self.rig).scene
+        baseline = np.linalg.norm(scene.cam_from_rig[1, 4:])
+        if not baseline > 0.0:
+            raise InputError(f"{folder}: the rig of the model has no baseline")
+        scale = self.rig.baseline_m / baseline
+        cam_from_rig = _scaled(scene.cam_from_rig, scale)
+        if self.rig.cam_from_rig is not None and not self.rig.refine_cam_from_rig:
+            cam_from_rig = self.rig.cam_from_rig
+        return replace(
+            scene,
+            cam_from_rig=cam_from_rig,
+            rig_from_world=_scaled(scene.rig_from_world, scale),
+            points=scale * scene.points,
+        )
+
+    def _from_pairs(self) -> CalibrationResult:
+        """Normals from single stereo pairs: section 3.2.1."""
+        frames = find_frames(self.source, self.rig, min_num_frames=1)
+        space = Workspace(work_dir=self.out / WORK)
+        steps = Steps(space.work_dir)
+        match_images(self.rig, frames, steps, space, self.front_end, self.progress)
+        scene = same_frame_scene(self.rig, frames, space.features)
+        options = {**self.options, **PAIRS_HOLD}
+        first = calibrate(scene, **options)
+        found = without_wrong_matches(replace(scene, cameras=first.scene.cameras))
+        return calibrate(found, **options)
+
+    def _finish(self, calibration: CalibrationResult) -> HousingResult:
+        scene, _ = calibration.scene.select(calibration.inliers)
+        rig = self.rig.with_geometry(scene.cam_from_rig, scene.ports)
+        lenses: list[Any] = [camera.camera for camera in scene.cameras]
+        pairs = zip(rig.cameras, lenses, strict=True)
+        rig = replace(rig, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
+        options = dict(self.options)
+        if self.start == "pairs":
+            options |= PAIRS_HOLD
+        budget = error_budget(scene, **options)
+        summary = {
+            "strategy": calibration.options.strategy,
+            "error": calibration.options.error_name,
+            "start": self.start,
+            **errors_summary(calibration),
+            "cameras": housing_summary(rig, calibration),
+            "refined": refined_summary(rig, calibration),
+            "warnings": housing_warnings(rig, calibration),
+            "error_budget": budget_summary(budget),
+            "versions": versions(),
+        }
+        export_housing(rig, self.out / HOUSING, calibration)
+        write_json(summary, self.out / CALIBRATION)
+        return HousingResult(
+            rig=rig, calibration=calibration, budget=budget, summary=summary
+        )
+
+
+PAIRS_HOLD = {"refine_distances": False, "refine_cam_from_rig": False}
+"""What single stereo pairs cannot tell."""
+
+
+def _require_distances_held(
+    rig: Rig, options: Mapping[str, Any], num_frames: int
+) -> None:
+    wanted = np.broadcast_to(options["refine_distances"], len(rig.cameras))
+    if np.any(wanted):
+        index = int(np.argmax(wanted))
+        what = "one stereo pair" if num_frames == 1 else "single stereo pairs"
+        raise InputError(
+            f"cameras[{index}].port.refine: the distance of a port cannot be estimated "
+            f"from {what}, because for every distance there are points that fit; "
+            "give the distance and write refine: [normal], or use more frames"
+        )
+
+
+def _model_folder(source: Path) -> Path | None:
+    """Where a COLMAP model is, in a folder that may be one or hold one."""
+    for folder in (source, source / SPARSE, source / SPARSE / "0"):
+        if any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
+            return folder
+    return None
+
+
+def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+    scaled = poses.copy()
+    scaled[:, 4:] *= scale
+    return scaled
