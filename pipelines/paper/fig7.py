@@ -56,7 +56,7 @@ def plot(found: Tables, out: Path) -> None:
     normal.plot([], [], "k--", linewidth=1.1, label="Cramér-Rao bound (RMS)")
     ratio.axhspan(0.85, 1.15, color="#e7f5ff", zorder=0)
     ratio.axhline(1.0, color="black", linewidth=0.8)
-    ratio.set_ylim(0.6, 1.6)
+    ratio.set_ylim(0.7, 1.45)
     _label(normal, "angle between normal and truth", "deg")
     _label(distance, "distance minus truth (20 mm)", "mm")
     _label(ratio, "RMSE over bound, and its Monte-Carlo error", "ratio")

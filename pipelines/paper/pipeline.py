@@ -8,6 +8,7 @@ figure 8 has rendered images only. With --only fig3,fig7 other figures keep thei
 """
 
 import argparse
+import textwrap
 import time
 from pathlib import Path
 
@@ -47,7 +48,8 @@ def main() -> None:
             figure.plot(found, out)
             sections.append(figure.section(found))
     with replaced_file(out / "README.md") as partial:
-        partial.write_text("\n\n".join(s.strip() for s in sections) + "\n", "utf-8")
+        text = "\n\n".join(filled(section) for section in sections if section)
+        partial.write_text(text + "\n", encoding="utf-8")
     print(f"{out / 'README.md'}")
 
 
@@ -105,6 +107,15 @@ def times(out: Path) -> str:
     total = sum(row["minutes"] for row in rows)
     processes = rows[0]["processes"]
     return f"Time: {each}; {total:.0f} min in all, with {processes:.0f} processes."
+
+
+def filled(text: str) -> str:
+    """Lines of equal length again, now that the numbers are in; tables stay."""
+    blocks = text.strip().split("\n\n")
+    prose = [
+        block if block[0] in "|#!" else textwrap.fill(block, 88) for block in blocks
+    ]
+    return "\n\n".join(prose)
 
 
 HEADER = """# Results: the source paper's figures
