@@ -96,9 +96,12 @@ def _losses(spreads: Sequence[Row]) -> str:
     }
     if not len(tilts["tank"]) or not np.any(tilts["tank"] > tilts["paper"]):
         return ""
+    spread_mm = max(
+        column(select(spreads, data="tank", method="all parameters"), "distance_sd_mm")
+    )
     return (
-        "sets of 8 small images of the tank repeat worse than the paper's trials, left "
-        "or right, and their distances by millimetres. And "
+        "the tank's sets of 8 small images repeat worse than the paper's trials, in "
+        f"one camera at least, and their distances scatter by {spread_mm:.1f} mm. And "
     )
 
 
