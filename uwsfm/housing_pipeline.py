@@ -181,10 +181,7 @@ class _Job:
         lenses: list[Any] = [camera.camera for camera in scene.cameras]
         pairs = zip(rig.cameras, lenses, strict=True)
         rig = replace(rig, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
-        options = dict(self.options)
-        if self.start == "pairs":
-            options |= PAIRS_HOLD
-        budget = error_budget(scene, **options)
+        budget = error_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,

@@ -1,4 +1,4 @@
-"""What errors of the given numbers would do to the estimates, and how large they are."""
+"""What errors of the given numbers would do, and how large such errors are."""
 
 import json
 from pathlib import Path
@@ -6,20 +6,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uwsfm import Model, error_budget
+from uwsfm import CalibrationResult, error_budget
 
 
-def budget_table(model: Model, refine_cam_from_rig: bool) -> str:
+def budget_table(calibration: CalibrationResult) -> str:
     """Shifts of tilts and distances when a given number is wrong in both cameras."""
-    rows = error_budget(model.scene, refine_cam_from_rig=refine_cam_from_rig)
+    rows = error_budget(calibration)
     lines = [
         "| if this were so | left: tilt deg | distance mm | right: tilt | distance |",
         "|---|---|---|---|---|",
     ]
     for row in rows:
         cells = []
+        sign = "" if row is rows[-1] else "+"
         for shift in row.shifts:
-            cells += [f"{shift.tilt_deg:.2f}", f"{1e3 * shift.distance_m:+.1f}"]
+            cells += [f"{shift.tilt_deg:.2f}", f"{1e3 * shift.distance_m:{sign}.1f}"]
         lines.append(f"| {row.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

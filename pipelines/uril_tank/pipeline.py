@@ -103,7 +103,7 @@ def main() -> None:
         f"{pinhole.common_error(result.model):.3f} px, "
         f"self-calibrated {pinhole.common_own_error(result.model):.3f} px\n"
     )
-    print(budget_table(result.model, rig.refine_cam_from_rig))
+    print(budget_table(result.calibration))
     print(f"\n{recalibration(data)}")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm.calibration.priors import border_priors
-from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.calibration.uncertainty import likelihood
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
@@ -47,7 +47,7 @@ class BudgetRow:
     """One per camera."""
 
 
-def error_budget(scene: Scene, **options: Any) -> tuple[BudgetRow, ...]:
+def error_budget(result: CalibrationResult) -> tuple[BudgetRow, ...]:
     """Shifts of all ports for a standard set of errors, by linear propagation.
 
     A number that is refined without a prior shifts nothing; with one, its prior is what
@@ -55,16 +55,12 @@ def error_budget(scene: Scene, **options: Any) -> tuple[BudgetRow, ...]:
     lengths of shifts, whose signs are lost.
 
     Args:
-        scene: at its optimum, with the observations that were used only.
-        **options: fields of `CalibrateOptions`, as for the calibration.
+        result: of a calibration; its options say what was held.
 
     Returns:
         One row per error; NaN if the observations do not determine the estimates.
-
-    Raises:
-        InputError: an unknown option.
     """
-    settings = CalibrateOptions.parsed(options)
+    scene, settings = result.scene.select(result.inliers)[0], result.options
     changes = _standard_changes(scene)
     models = [camera.camera.model_name for camera in scene.cameras]
     at_zero = np.array([port.distance == 0.0 for port in scene.ports])
