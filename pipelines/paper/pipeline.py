@@ -112,10 +112,8 @@ def times(out: Path) -> str:
 def filled(text: str) -> str:
     """Lines of equal length again, now that the numbers are in; tables stay."""
     blocks = text.strip().split("\n\n")
-    prose = [
-        block if block[0] in "|#!" else textwrap.fill(block, 88) for block in blocks
-    ]
-    return "\n\n".join(prose)
+    wrapper = textwrap.TextWrapper(width=88, break_on_hyphens=False)
+    return "\n\n".join(b if b[0] in "|#!" else wrapper.fill(b) for b in blocks)
 
 
 HEADER = """# Results: the source paper's figures
