@@ -18,14 +18,19 @@ from uwsfm.simulate.trajectories import rich_motion
 
 
 def simulated_dive(
-    rig: Rig | None = None, num_frames: int = 6, num_points: int = 1200
+    rig: Rig | None = None,
+    num_frames: int = 6,
+    num_points: int = 1200,
+    seed: int = 0,
 ) -> SimulatedScene:
     """What a rig with tilted ports sees on a varied dive, with the noise of SIFT."""
     return simulate_scene(
         rig or sample_rig(),
         rich_motion(num_frames),
-        Relief(stddev=0.15, correlation_length=0.4),
-        ObservationOptions(num_points=num_points, noise_px=0.4, detection_rate=0.6),
+        Relief(stddev=0.15, correlation_length=0.4, seed=seed),
+        ObservationOptions(
+            num_points=num_points, noise_px=0.4, detection_rate=0.6, seed=seed
+        ),
     )
 
 

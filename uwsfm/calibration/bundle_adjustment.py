@@ -67,6 +67,8 @@ def calibrate(
     if settings.loss != "l2":
         sigma = solved.robust_sigma()
         solved = run.solve(solved.state, run.prune(solved.state, sigma), "l2", sigma)
+    elif run.priors(1.0) is not None:  # they were weighed for a noise of 1 px
+        solved = run.solve(solved.state, everything, "l2", solved.sigma())
     summary = _summary(run, solved, time.perf_counter() - began)
     return CalibrationResult(
         scene=solved.state.to_scene(scene),
@@ -91,6 +93,11 @@ def _check(scene: Scene, settings: CalibrateOptions) -> None:
         raise InputError(
             f"the distance of a port cannot be estimated from {frames} frame: any "
             "distance fits one stereo pair; add frames or set refine_distances=False"
+        )
+    if frames < 2 and settings.error_name == "point_3d":
+        raise InputError(
+            f"error 'point_3d' tells nothing from {frames} frame: its points can be "
+            "where the rays meet, whatever the ports; add frames or use another error"
         )
     indices = {port.n_water for port in scene.ports}
     if settings.refine_water_index and len(indices) > 1:
@@ -122,6 +129,20 @@ class _Solved:
         unknowns = layout.num_frame_cols + layout.num_border_cols + 3 * len(self.used)
         return 2 * (len(layout.xy) - self.result.num_invalid) - unknowns
 
+    def sigma(self) -> float:
+        """Noise of one coordinate, px.
+
+        Raises:
+            InputError: there are no more observations than unknowns.
+        """
+        freedom, squares = self.degrees_of_freedom, self.result.squares
+        if freedom <= 0:
+            count = len(squares) - self.result.num_invalid
+            raise InputError(
+                f"{count} observations are too few for what is to be refined"
+            )
+        return float(np.sqrt(np.nansum(squares) / freedom))
+
     def robust_sigma(self) -> float:
         """Noise of one coordinate from the median residual, px.
 
@@ -140,10 +161,10 @@ def in_shared_cells(scene: Scene, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
         keep: (N,) observations that count.
     """
     cell = scene.point_idx * scene.num_frames + scene.frame_idx
-    _, index, counts = np.unique(cell[keep], return_inverse=True, return_counts=True)
-    shared = np.zeros(len(keep), dtype=bool)
-    shared[keep] = counts[index] >= 2
-    return shared
+    num_cameras = len(scene.cameras)
+    views = np.unique(cell[keep] * num_cameras + scene.camera_idx[keep])
+    cells, counts = np.unique(views // num_cameras, return_counts=True)
+    return keep & np.isin(cell, cells[counts >= 2])
 
 
 class _Run:
@@ -239,13 +260,9 @@ def _check_normals(state: State) -> None:
 
 def _summary(run: _Run, solved: _Solved, seconds: float) -> CalibrateSummary:
     scene = run.scene
+    sigma_px = solved.sigma()
     before = np.sum(scene.residuals() ** 2, axis=1)
     squares = solved.result.squares[np.isfinite(solved.result.squares)]
-    freedom = solved.degrees_of_freedom
-    if freedom <= 0:
-        raise InputError(
-            f"{len(squares)} observations are too few for what is to be refined"
-        )
     return CalibrateSummary(
         num_frames=len(np.unique(solved.layout.cell_frame)),
         num_points=len(solved.used),
@@ -257,7 +274,7 @@ def _summary(run: _Run, solved: _Solved, seconds: float) -> CalibrateSummary:
         initial_rms_px=float(np.sqrt(np.nanmean(before))),
         rms_px=float(np.sqrt(np.mean(squares))),
         mean_error_px=float(np.mean(np.sqrt(squares))),
-        sigma_px=float(np.sqrt(np.sum(squares) / freedom)),
+        sigma_px=sigma_px,
         solve_s=seconds,
     )
 

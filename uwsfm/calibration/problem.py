@@ -124,6 +124,11 @@ class CalibrateOptions:
                     f"{name} needs the reprojection error: in {self.error_name} the "
                     "pixels' rays in air are given"
                 )
+        if self.error_name == "point_3d" and self.baseline_stddev_m > 0.0:
+            raise InputError(
+                "error 'point_3d' is measured in metres, which a free baseline "
+                "shrinks: give baseline_stddev_m=0"
+            )
         if self.strategy == "joint" and np.any(self.refine_distances):
             raise InputError(
                 f"error {self.error_name!r} is measured in metres, which a port "

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import scipy.optimize
+from numpy.typing import NDArray
 
+from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
@@ -20,6 +22,7 @@ from uwsfm.solver.levenberg_marquardt import (
     Stop,
     minimize,
 )
+from uwsfm.solver.normal_equations import MIN_DIAGONAL
 from uwsfm.solver.state import State
 
 Strategy = Callable[
@@ -29,6 +32,9 @@ Strategy = Callable[
 
 TOLERANCE = 1e-5
 """Of the nested strategy's distances, relative."""
+
+MIN_START = 1e-3
+"""Of its distances, metres: all its steps are relative."""
 
 
 def minimize_nested(
@@ -48,17 +54,20 @@ def minimize_nested(
     """
     loops = NestedLoops(layout, options, priors)
     passes = _Passes(loops, state, report)
-    free = loops.inner.border_col[:, border.DISTANCE] != HELD
-    if not np.any(free):
+    if not np.any(loops.free):
         return loops.settle(state)
     found = scipy.optimize.root(
         passes.change,
-        state.ports[free, 3],
+        np.maximum(state.ports[loops.free, 3], MIN_START),
         method="hybr",
-        # Steps of the numerical Jacobian: 1 %, far above what a solve leaves open.
-        options={"xtol": TOLERANCE, "eps": 1e-4, "maxfev": options.max_iterations},
+        options={
+            "xtol": TOLERANCE,
+            "eps": 1e-4,  # differences of 1 %, far above what a solve leaves open
+            "factor": 0.3,  # a longer first step overshoots, to false roots below zero
+            "maxfev": options.max_iterations,
+        },
     )
-    final = loops.settle(passes.state)
+    final = loops.settle(passes.state_at(found.x))  # the last pass was a trial
     stop = Stop.CONVERGED if found.success else Stop.MAX_ITERATIONS
     if final.stop is not Stop.CONVERGED:
         stop = final.stop
@@ -80,14 +89,28 @@ class NestedLoops:
         self.outer = _compacted(layout, held)
         self.inner = _distances_only(layout)
         self._options, self._priors = options, priors
+        wanted = self.inner.border_col[:, border.DISTANCE] != HELD
+        seen = np.bincount(layout.camera, minlength=len(wanted)) > 0
+        self.free: NDArray[np.bool_] = wanted & seen
+        """(C,) distances that move."""
 
     def settle(self, state: State) -> LevenbergMarquardtResult:
         """The outer loop: everything but the distances."""
         return minimize(self.outer, state, self._options, self._priors)
 
     def one_pass(self, state: State) -> tuple[State, LevenbergMarquardtResult]:
-        """The outer loop, then the inner one."""
+        """The outer loop, then the inner one.
+
+        Raises:
+            UwsfmError: the outer loop ended where no observation can be projected.
+        """
         settled = self.settle(state)
+        if settled.num_invalid == len(settled.squares):
+            distances = ", ".join(f"{value:.3f}" for value in state.ports[:, 3])
+            raise UwsfmError(
+                f"no observation can be projected any more at port distances of "
+                f"{distances} m: start closer to the truth, or use strategy='joint'"
+            )
         moved = _best_distances(self.inner, settled.state, self._options, self._priors)
         return moved, settled
 
@@ -97,22 +120,22 @@ class _Passes:
 
     def __init__(self, loops: NestedLoops, state: State, report: Report | None) -> None:
         self._loops, self._report = loops, report
-        self._free = loops.inner.border_col[:, border.DISTANCE] != HELD
         self.state = state
         self.num_iterations = 0
 
     def change(self, distances: Array) -> Array:
-        self.state = self._with(distances)
+        self.state = self.state_at(distances)
         moved, settled = self._loops.one_pass(self.state)
         self.state = settled.state
         self.num_iterations += settled.num_iterations
         if self._report is not None:
             self._report(self.num_iterations, settled.cost)
-        return moved.ports[self._free, 3] - distances
+        return moved.ports[self._loops.free, 3] - distances
 
-    def _with(self, distances: Array) -> State:
+    def state_at(self, distances: Array) -> State:
+        """The latest state, with other distances."""
         ports = self.state.ports.copy()
-        ports[self._free, 3] = distances
+        ports[self._loops.free, 3] = distances
         return replace(self.state, ports=ports)
 
 
@@ -143,7 +166,9 @@ def _best_distances(
     problem = Problem(layout, error, options, priors)
     for _ in range(10):
         eqs = problem.linearize(state)
-        step = -np.linalg.solve(eqs.border, eqs.border_grad)
+        # Diagonal, as an observation has one camera; zero for a camera without any.
+        curvature = np.maximum(np.diag(eqs.border), MIN_DIAGONAL)
+        step = -eqs.border_grad / curvature
         still = np.zeros(layout.num_frame_cols)
         state = state.moved(
             layout, np.concatenate([still, step]), np.zeros_like(state.points)

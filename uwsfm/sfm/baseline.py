@@ -35,6 +35,8 @@ MAX_FRAMES = 500  # each is compared with all the others
 MAX_SPREAD = 0.2
 """Frames that differ more from the median, in radians or as a fraction of the
 baseline, are left out."""
+LOSS_SCALE_PX = 2.0
+"""Where the robust loss of the adjustment sets in; see `_adjust`."""
 
 
 def rig_from_baseline(
@@ -72,9 +74,7 @@ def rig_from_baseline(
         progress,
         model="RADIAL",
     )
-    models = map_images(
-        database_path, frames, options, refine_distortion=True, progress=progress
-    )
+    models = map_images(database_path, frames, options, free=True, progress=progress)
     relative = _relative_poses(models[0], frames)
     if len(relative) < MIN_FRAMES:
         raise UwsfmError(
@@ -121,7 +121,9 @@ def _adjust(
 ) -> Array:
     """Bundle adjustment of rig poses, relative pose, distortion and points (7,).
 
-    Everything is in the units of the model.
+    Everything is in the units of the model. The loss is robust: a wrong match that
+    fitted while every image was free may lie 60 px off once the rig holds; two such
+    observations among 4600 turned the baseline by 4 degrees under a quadratic loss.
     """
     poses = np.stack([rigid3.IDENTITY, pose])
     with opened(database_path) as database:
@@ -130,6 +132,8 @@ def _adjust(
         options.refine_focal_length = False
         options.refine_extra_params = True
         options.refine_sensor_from_rig = True
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = LOSS_SCALE_PX
         options.print_summary = False
         config = pycolmap.BundleAdjustmentConfig()
         for image_id in model.reg_image_ids():

@@ -18,6 +18,10 @@ MIN_INIT_INLIERS = 50
 MIN_INIT_ANGLE_DEG = 4.0
 """Between the rays of the first pair. COLMAP's 16 degrees is out of reach for a rig
 with a short baseline that moves little; the mapper halves it where it must."""
+MIN_INIT_ANGLE_FREE_DEG = 16.0
+"""The same without a rig: at 4 degrees the mapper may begin with the two images of one
+frame, whose pose their short baseline leaves uncertain by degrees, and no rig holds it.
+Halved twice, it is still 4."""
 MAX_EXTRA_PARAM = 1e3  # held parameters are not bogus, however large
 
 
@@ -26,7 +30,7 @@ def map_images(
     frames: Frames,
     options: StartOptions,
     *,
-    refine_distortion: bool = False,
+    free: bool = False,
     progress: Progress = silent,
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct from a mapping database; the models with most images come first.
@@ -35,7 +39,7 @@ def map_images(
         mapping_path: From `write_mapping_database`.
         frames: The images.
         options: Those of the mapping are used, and the seed.
-        refine_distortion: Also refine the extra parameters of the cameras.
+        free: The database has no rig, and the cameras' distortion is refined.
         progress: Called with the step "mapping", in frames.
 
     Raises:
@@ -59,7 +63,7 @@ def map_images(
                 mapping_path,
                 frames.image_dir,
                 scratch,
-                options=_pipeline_options(options, refine_distortion),
+                options=_pipeline_options(options, free),
                 initial_image_pair_callback=began,
                 next_image_callback=went_on,
                 cancellation_token=token,
@@ -80,12 +84,12 @@ def map_images(
 
 
 def _pipeline_options(
-    options: StartOptions, refine_distortion: bool
+    options: StartOptions, free: bool
 ) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.ba_refine_focal_length = False
     pipeline.ba_refine_principal_point = False
-    pipeline.ba_refine_extra_params = refine_distortion
+    pipeline.ba_refine_extra_params = free
     pipeline.ba_refine_sensor_from_rig = False
     pipeline.max_extra_param = MAX_EXTRA_PARAM
     pipeline.min_model_size = 2
@@ -93,7 +97,9 @@ def _pipeline_options(
     pipeline.random_seed = options.seed
     pipeline.num_threads = options.threads
     pipeline.mapper.init_min_num_inliers = MIN_INIT_INLIERS
-    pipeline.mapper.init_min_tri_angle = MIN_INIT_ANGLE_DEG
+    pipeline.mapper.init_min_tri_angle = (
+        MIN_INIT_ANGLE_FREE_DEG if free else MIN_INIT_ANGLE_DEG
+    )
     pipeline.mapper.filter_max_reproj_error = options.mapping.max_error_px
     pipeline.mapper.filter_min_tri_angle = options.mapping.min_angle_deg
     pipeline.triangulation.merge_max_reproj_error = options.mapping.max_error_px

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uwsfm._jit import kernel
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import dir_from_img
@@ -35,7 +36,11 @@ class ErrorModel(NamedTuple):
 
 
 def error_model(name: str, layout: Layout, state: State) -> ErrorModel:
-    """The error function of a name, for a start."""
+    """The error function of a name, for a start.
+
+    Raises:
+        InputError: a virtual camera would have no focal length.
+    """
     code = ERROR_CODES[name]
     if code == REPROJECTION:
         return ErrorModel(code, 1.0, np.empty((0, 3)))
@@ -49,6 +54,12 @@ def error_model(name: str, layout: Layout, state: State) -> ErrorModel:
         return ErrorModel(code, float(np.mean(focal * n_water / n_air) / reach), dirs)
     # Paraxial focal length of the virtual camera, over its magnification n_w.
     length = np.abs(state.ports[:, 3] + thick * n_air / n_glass)
+    if np.any(length == 0.0):
+        camera = int(np.flatnonzero(length == 0.0)[0])
+        raise InputError(
+            f"the port of camera {camera} has no distance and no glass: error {name!r} "
+            "is zero there whatever the point, start from a distance"
+        )
     return ErrorModel(code, float(np.mean(focal / np.maximum(length, 1e-4))), dirs)
 
 

@@ -145,7 +145,7 @@ class Work(NamedTuple):
 
 
 @kernel
-def _work(num_border, num_cameras):
+def _work(num_border, num_cameras, largest_cell):
     return Work(
         np.empty((3, 3)),
         np.empty(3),
@@ -156,14 +156,16 @@ def _work(num_border, num_cameras):
         np.empty((2, 9)),
         np.zeros((4, 3)),  # a virtual camera's error has three rows and one of zeros
         np.zeros((4, BORDER_SIZE)),
-        np.zeros((num_cameras, 3, BORDER_SIZE)),
+        np.zeros((largest_cell, 3, BORDER_SIZE)),
     )
 
 
 @kernel
 def linearize(layout, state, error, loss, scale, out):
     """Fill zeroed `NormalEquations` at a state, with weights rho'(s)."""
-    work = _work(len(out.border_grad), len(state.cams))
+    # A camera may have matched two features of an image to one point.
+    largest_cell = np.diff(layout.cell_start).max()
+    work = _work(len(out.border_grad), len(state.cams), largest_cell)
     for p in range(len(layout.point_start) - 1):
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             f = layout.cell_frame[c]
