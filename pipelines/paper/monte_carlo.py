@@ -17,6 +17,7 @@ from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
 from uwsfm.models.port import FlatPort
+from uwsfm.residuals.border import DISTANCE, NORMAL
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
@@ -100,24 +101,25 @@ def distance_errors_mm(found: Scene, truth: Scene) -> list[float]:
 
 
 def z_scores(result: CalibrationResult, truth: Scene) -> tuple[Array, Array]:
-    """Errors over their reported standard deviations.
+    """Errors over the standard deviations of `Covariance.border`.
+
+    Those that are reported are never smaller: they allow for neighbours that err
+    together, which simulated noise does not.
 
     Returns:
         Of two components of each normal (C, 2), and of the distances (C,).
     """
-    cov = result.covariance
+    columns = result.covariance.border_cols
+    # What is held has column -1: the zero at the end.
+    stddevs = np.sqrt(np.append(np.diag(result.covariance.border), 0.0))
     normals, distances = [], []
-    for camera, reported in enumerate(cov.cameras):
-        found, true = result.scene.ports[camera], truth.ports[camera]
-        columns = cov.border_cols[camera, 6:8]
-        variances = np.diag(cov.border)[columns]
-        # What is reported allows for neighbours that err together: it is not smaller.
-        scale = np.radians(reported.normal_stddev_deg) / np.sqrt(np.sum(variances))
+    for camera, true in enumerate(truth.ports):
+        found = result.scene.ports[camera]
         offset = -tangent_basis(found.normal).T @ true.normal
-        normals.append(offset / (scale * np.sqrt(variances)))
-        stddev = reported.distance_stddev_m
-        held = stddev == 0.0
-        distances.append(0.0 if held else (found.distance - true.distance) / stddev)
+        normals.append(offset / stddevs[columns[camera, NORMAL]])
+        stddev = stddevs[columns[camera, DISTANCE]]
+        error = found.distance - true.distance
+        distances.append(error / stddev if stddev > 0.0 else 0.0)
     return np.array(normals), np.array(distances)
 
 

@@ -16,13 +16,14 @@ import fig3
 import fig6
 import fig7
 import fig8
+import loops
 import targets
 from settings import Settings
 from tables import Tables, read_csv, write_csv
 
 from uwsfm._files import replaced_file
 
-FIGURES = {"fig3": fig3, "fig6": fig6, "fig7": fig7, "fig8": fig8}
+FIGURES = {"fig3": fig3, "fig6": fig6, "fig7": fig7, "loops": loops, "fig8": fig8}
 TIMES = "times.csv"
 
 
