@@ -103,6 +103,18 @@ def test_many_pairs_table(tmp_path):
     assert noisy["converged_percent"] == 100.0
 
 
+def test_loops_repeated_as_printed_creep_to_the_same_end():
+    import loops
+    import many_pairs
+
+    case = many_pairs.Case(name="tiny", num_frames=5, num_points=60)
+    root, *passes = loops.table(case, shown=(1, 3, 10))
+    missing = [row["missing_mm"] for row in passes]
+    assert root["missing_mm"] == 0.0
+    assert missing[0] > missing[1] > missing[2] > 0.5 * missing[0]
+    assert "repeated as printed" in loops.section({"loops": [root, *passes]})
+
+
 def test_basin_table():
     import basin
 
