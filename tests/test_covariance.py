@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from dense import dense_system, small_scene
+from scipy.sparse.linalg import splu
 
 from uwsfm import CalibrateOptions, calibrate
 from uwsfm.calibration.uncertainty import camera_variances, likelihood
 from uwsfm.residuals.border import BORDER_SIZE, WATER_INDEX
-from uwsfm.simulate import perturbed
+from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
+from uwsfm.simulate.rigs import paper_rig
+from uwsfm.simulate.trajectories import lawn_mower
 from uwsfm.solver.covariance import point_covariances, reduced_covariance
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.state import State
@@ -66,6 +70,69 @@ def test_every_marginal_is_that_of_the_dense_normal_matrix():
     for p, block in enumerate(point_covariances(layout, eqs, reduced)):
         inside = slice(size + 3 * p, size + 3 * p + 3)
         assert_close(block, dense[inside, inside])
+
+
+@pytest.mark.slow
+def test_border_of_500_frames_is_that_of_the_sparse_normal_matrix():
+    """A survey: the marginal over 2994 pose and 12000 point unknowns, two ways."""
+    seen = ObservationOptions(num_points=4000, detection_rate=0.7)
+    lines = lawn_mower(20, 25)
+    truth = simulate_scene(paper_rig(), lines, Relief(stddev=0.2), seen).truth
+    layout, eqs = linearized(truth, CalibrateOptions())
+    reduced = reduced_covariance(layout, eqs)
+    assert reduced.determined and layout.num_frame_cols == 6 * 499
+    whole = sparse_normal_matrix(layout, eqs)
+    scale = 1.0 / np.sqrt(whole.diagonal())
+    scaled = (sp.diags_array(scale) @ whole @ sp.diags_array(scale)).tocsc()
+    offset, size = layout.num_frame_cols, layout.num_border_cols
+    right = np.zeros((whole.shape[0], size))
+    right[offset : offset + size] = np.eye(size)
+    inside = slice(offset, offset + size)
+    expected = splu(scaled).solve(right)[inside] * np.outer(
+        scale[inside], scale[inside]
+    )
+    spread = np.sqrt(np.diag(expected))
+    error = np.abs(reduced.border(layout) - expected) / np.outer(spread, spread)
+    # A survey bends: the scaled matrix has condition 1e9, 1e-16 of it twice.
+    assert error.max() < 1e-5
+
+
+def sparse_normal_matrix(layout, eqs):
+    """J^T J of frames, border and points, from its blocks, as a sparse matrix."""
+    offset, size = layout.num_frame_cols, layout.num_border_cols
+    first = offset + size
+    rows, cols, values = [], [], []
+
+    def add(row, col, block):
+        mesh = np.meshgrid(
+            row + np.arange(block.shape[0]),
+            col + np.arange(block.shape[1]),
+            indexing="ij",
+        )
+        rows.append(mesh[0].ravel())
+        cols.append(mesh[1].ravel())
+        values.append(block.ravel())
+
+    def add_both(row, col, block):
+        add(row, col, block)
+        add(col, row, block.T)
+
+    add(offset, offset, eqs.border)
+    for frame, col in enumerate(layout.frame_col):
+        if col != HELD:
+            add(col, col, eqs.frames[frame])
+            add_both(col, offset, eqs.frames_border[frame])
+    for point in range(len(eqs.points)):
+        at = first + 3 * point
+        add(at, at, eqs.points[point])
+        add_both(at, offset, eqs.points_border[point])
+        for cell in range(layout.point_start[point], layout.point_start[point + 1]):
+            col = layout.frame_col[layout.cell_frame[cell]]
+            if col != HELD:
+                add_both(col, at, eqs.cells[cell])
+    shape = (first + 3 * len(eqs.points),) * 2
+    triplets = (np.concatenate(rows), np.concatenate(cols))
+    return sp.coo_array((np.concatenate(values), triplets), shape=shape).tocsc()
 
 
 def test_free_scale_is_found_to_be_undetermined():
