@@ -117,19 +117,6 @@ def ray_gaps_px(
     return np.abs(miss) / np.sqrt(np.sum(in_a**2 + in_b**2, axis=1))
 
 
-def epipolar_inliers(
-    camera_a: RefractiveCamera,
-    camera_b: RefractiveCamera,
-    b_from_a: Array,
-    xy_a: Array,
-    xy_b: Array,
-    *,
-    max_gap_px: float,
-) -> NDArray[np.bool_]:
-    """Mask (N,) of the matches whose water rays nearly meet; see `ray_gaps_px`."""
-    return ray_gaps_px(camera_a, camera_b, b_from_a, xy_a, xy_b) <= max_gap_px
-
-
 def relative_pose(cam_from_rig: Array, camera_a: int, camera_b: int) -> Array:
     """Pose b_from_a (7,) of two cameras of a rig (C, 7)."""
     return rigid3.compose(
