@@ -134,6 +134,7 @@ def _adjust(
         options.refine_sensor_from_rig = True
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = LOSS_SCALE_PX
+        options.ceres.solver_options.num_threads = 1  # the same sums in every run
         options.print_summary = False
         config = pycolmap.BundleAdjustmentConfig()
         for image_id in model.reg_image_ids():

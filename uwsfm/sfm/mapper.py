@@ -95,7 +95,9 @@ def _pipeline_options(
     pipeline.min_model_size = 2
     pipeline.extract_colors = False
     pipeline.random_seed = options.seed
-    pipeline.num_threads = options.threads
+    # With more, the search for the first pair is a race (the task that succeeds first
+    # stops the others), and sums of large adjustments depend on who came first.
+    pipeline.num_threads = 1
     pipeline.mapper.init_min_num_inliers = MIN_INIT_INLIERS
     pipeline.mapper.init_min_tri_angle = (
         MIN_INIT_ANGLE_FREE_DEG if free else MIN_INIT_ANGLE_DEG

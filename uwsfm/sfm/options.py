@@ -115,7 +115,7 @@ class StartOptions:
     mapping: MappingOptions = field(default_factory=MappingOptions)
     seed: int = 0
     num_threads: int = -1
-    """-1: all cores."""
+    """-1: all cores. Mapping takes one, so that it is repeatable."""
 
     def __post_init__(self) -> None:
         if self.num_threads == 0 or self.num_threads < -1:
