@@ -219,6 +219,9 @@ def test_layout_sorts_observations_and_holds_the_first_observed_frame(rng):
         scene, CalibrateOptions().border_columns(MODELS, NONE_AT_ZERO)
     )
     assert layout.frame_col.tolist() == [HELD, HELD, 0, 6]
+    held = np.array([False, False, True, False])
+    local = build_layout(scene, layout.border_col, held)
+    assert local.frame_col.tolist() == [HELD, 0, HELD, 6]
     table = np.column_stack([scene.point_idx, scene.frame_idx, scene.camera_idx])
     assert table[layout.order].tolist() == sorted(table.tolist())
     np.testing.assert_array_equal(layout.xy, scene.xy[layout.order])

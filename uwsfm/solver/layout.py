@@ -7,6 +7,7 @@ is a *cell*: only there do point and pose meet, whatever the number of cameras.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
@@ -53,12 +54,18 @@ class Layout(NamedTuple):
         return int(self.border_col.max(initial=-1)) + 1
 
 
-def build_layout(scene: Scene, border_col: IndexArray) -> Layout:
-    """Sort a scene's observations; the first observed frame is held (gauge).
+def build_layout(
+    scene: Scene,
+    border_col: IndexArray,
+    held_frames: NDArray[np.bool_] | None = None,
+) -> Layout:
+    """Sort a scene's observations.
 
     Args:
         scene: every point with an observation has at least two.
         border_col: (C, BORDER_SIZE).
+        held_frames: (F,) frames that do not move. None: the first observed one, which
+            fixes the place of the world.
 
     Raises:
         InputError: the scene has no observations.
@@ -73,7 +80,8 @@ def build_layout(scene: Scene, border_col: IndexArray) -> Layout:
     cells_of_point = np.bincount(point[starts], minlength=scene.num_points)
     observed = np.unique(frame)
     frame_col = np.full(scene.num_frames, HELD, dtype=np.int64)
-    frame_col[observed[1:]] = 6 * np.arange(len(observed) - 1)
+    free = observed[1:] if held_frames is None else observed[~held_frames[observed]]
+    frame_col[free] = 6 * np.arange(len(free))
     layout = Layout(
         xy=np.ascontiguousarray(scene.xy[order]),
         camera=np.ascontiguousarray(scene.camera_idx[order]),
