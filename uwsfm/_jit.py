@@ -1,9 +1,10 @@
 """The one decorator for compiled kernels, and where their machine code is kept.
 
 Numba keys its cache by the file of the outermost function only, so an edit in a
-kernel's callee would go unnoticed. Keying the cache folder by the source of the whole
-package makes stale code impossible; a folder that cannot be written (read-only home)
-moves to the temporary directory, and failing that, kernels compile in each process.
+kernel's callee would go unnoticed. Keying the cache folder by the source of everything
+that kernels are made of makes stale code impossible; a folder that cannot be written
+(read-only home) moves to the temporary directory, and failing that, kernels compile in
+each process.
 """
 
 import hashlib
@@ -20,12 +21,18 @@ from numba.core import config
 Function = TypeVar("Function", bound=Callable)
 
 
+# Kernels call and read only what is in these folders, or in their own file.
+_KERNEL_FOLDERS = ("geometry", "models", "residuals", "solver")
+
+
 def _source_key() -> str:
     digest = hashlib.sha1(numba.__version__.encode())
     root = Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode())
-        digest.update(path.read_bytes())
+        name, source = path.relative_to(root), path.read_bytes()
+        if name.parts[0] in _KERNEL_FOLDERS or b"uwsfm._jit" in source:
+            digest.update(name.as_posix().encode())
+            digest.update(source)
     return digest.hexdigest()[:16]
 
 
