@@ -1,0 +1,308 @@
+"""Pose of a rig of refractive cameras from pixels and the points that they see.
+
+Behind a port every pixel has its own viewpoint, so that a single camera already is a
+generalised one: hypotheses come from three water rays, everything is decided and
+adjusted on the exact reprojection error in true pixels. No pinhole and no scene
+distance is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import finite_rows, triangulate_tracks
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.sfm.absolute_pose_ransac import search_pose, trials_needed
+from uwsfm.solver.losses import LOSS_CODES
+from uwsfm.solver.rig_pose import refine_pose, squared_errors
+
+Mask = NDArray[np.bool_]
+IndexArray = NDArray[np.int64]
+Matches = tuple[Array, IndexArray, Array]
+RigRows = tuple[Array, Array, Array]
+
+CHUNK = 64
+"""Samples drawn at once: what is drawn does not depend on when the search ends."""
+MEDIAN_ERROR = 1.1774
+"""Median length of a 2-vector of unit normal noise: sqrt(2 log 2)."""
+NOISE_FLOOR_PX = 1e-6
+"""Noise below this is rounding, and would leave good matches out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AbsolutePoseOptions:
+    """How a pose is searched and adjusted."""
+
+    max_error_px: float = 8.0
+    """True reprojection error above which a match is an outlier. The final adjustment
+    cuts at `cut_stddevs` of the noise that it finds, so this may be generous."""
+    confidence: float = 0.9999
+    """Of having drawn a sample without outliers."""
+    min_trials: int = 64
+    max_trials: int = 20000
+    """Enough for 8 % of inliers."""
+    min_num_inliers: int = 6
+    """Fewer are no pose. Three always fit, a fourth tells the solutions apart."""
+    cut_stddevs: float = 3.5
+    """Matches with larger errors do not pull at the pose; 0.2 % of normal errors."""
+    max_iterations: int = 30
+    """Of each adjustment."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.max_error_px > 0.0 or not self.cut_stddevs > 0.0:
+            raise InputError("max_error_px and cut_stddevs must be positive")
+        if not 0.0 < self.confidence < 1.0:
+            raise InputError(f"confidence must be in (0, 1), got {self.confidence}")
+        if self.min_num_inliers < 4 or not 0 < self.min_trials <= self.max_trials:
+            raise InputError("a pose takes 4 inliers, and one trial, at least")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigPose:
+    """Where a rig is, and what speaks for it."""
+
+    rig_from_world: Array
+    """(7,)"""
+    inliers: Mask
+    """(N,) true reprojection error below `AbsolutePoseOptions.max_error_px`."""
+    num_inliers: int
+    errors_px: Array
+    """(N,) true reprojection errors; inf where the point does not project."""
+    noise_px: float
+    """Standard deviation of one coordinate, from the median error of the inliers."""
+    covariance: Array
+    """(6, 6) of the tangent [rotation, translation] as `rigid3.perturb`, of the noise
+    in the image alone: the points are taken as exact. inf if not determined."""
+    num_trials: int
+    """Samples drawn; 0 for a refinement."""
+
+
+def estimate_rig_pose(
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: ArrayLike,
+    camera_idx: ArrayLike,
+    xy: ArrayLike,
+    points: ArrayLike,
+    options: AbsolutePoseOptions | None = None,
+) -> RigPose | None:
+    """Find the pose of a rig from matches, many of which may be wrong.
+
+    Args:
+        cameras: (C,) with their ports.
+        cam_from_rig: (C, 7).
+        camera_idx: (N,) the camera of each match.
+        xy: (N, 2) pixels.
+        points: (N, 3) world, metres. Rows that are not finite are outliers.
+        options: Defaults suit maps in metres and errors of up to some pixels.
+
+    Returns:
+        The pose, the same for the same seed whatever else runs; None if no pose has
+        ``min_num_inliers``.
+
+    Raises:
+        InputError: arrays of other shapes, or an index without a camera.
+    """
+    options = options or AbsolutePoseOptions()
+    matches, rig = checked(cameras, cam_from_rig, camera_idx, xy, points)
+    rays = _near_rays(cameras, rig[0], matches)
+    usable = finite_rows(rays) & finite_rows(matches[0])
+    rows = np.flatnonzero(usable)
+    if len(rows) < options.min_num_inliers:
+        return None
+    rows = rows[np.argsort(matches[1][rows], kind="stable")]  # by camera
+    world, index, pixels = matches
+    usable_matches = (world[rows], index[rows], pixels[rows])
+    pose, trials = _search(rays[rows], usable_matches, rig, options)
+    if pose is None:
+        return None
+    return _refined(pose, matches, rig, options, trials)
+
+
+def refine_rig_pose(
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: ArrayLike,
+    camera_idx: ArrayLike,
+    xy: ArrayLike,
+    points: ArrayLike,
+    rig_from_world: ArrayLike,
+    options: AbsolutePoseOptions | None = None,
+) -> RigPose | None:
+    """Adjust a pose (7,) to the matches within ``max_error_px`` of it.
+
+    Arguments, result and errors as of `estimate_rig_pose`.
+    """
+    options = options or AbsolutePoseOptions()
+    matches, rig = checked(cameras, cam_from_rig, camera_idx, xy, points)
+    start = np.asarray(rig_from_world, dtype=np.float64)
+    if start.shape != (7,):
+        raise InputError(f"rig_from_world.shape={start.shape}, expected (7,)")
+    return _refined(rigid3.matrix_rows(start), matches, rig, options, 0)
+
+
+def checked(
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: ArrayLike,
+    camera_idx: ArrayLike,
+    xy: ArrayLike,
+    points: ArrayLike,
+) -> tuple[Matches, RigRows]:
+    """Matches and rig as the kernels read them.
+
+    Raises:
+        InputError: as of `estimate_rig_pose`.
+    """
+    poses = np.asarray(cam_from_rig, dtype=np.float64)
+    index = np.ascontiguousarray(camera_idx, dtype=np.int64)
+    pixels = np.ascontiguousarray(xy, dtype=np.float64)
+    world = np.ascontiguousarray(points, dtype=np.float64)
+    num = len(index)
+    expected = {
+        "cam_from_rig": (poses, (len(cameras), 7)),
+        "camera_idx": (index, (num,)),
+        "xy": (pixels, (num, 2)),
+        "points": (world, (num, 3)),
+    }
+    for name, (array, shape) in expected.items():
+        if array.shape != shape:
+            raise InputError(f"{name}.shape={array.shape}, expected {shape}")
+    if num and not (index.min() >= 0 and index.max() < len(cameras)):
+        raise InputError(f"camera_idx must be in 0..{len(cameras) - 1}")
+    return (world, index, pixels), rig_rows(cameras, poses)
+
+
+def rig_rows(cameras: Sequence[RefractiveCamera], cam_from_rig: Array) -> RigRows:
+    """Rows of cam_from_rig (C, 12), lenses and ports, as the kernels read them."""
+    return (
+        rigid3.matrix_rows(cam_from_rig),
+        np.array([camera.lens for camera in cameras]),
+        np.array([camera.port.params for camera in cameras]),
+    )
+
+
+def _near_rays(
+    cameras: Sequence[RefractiveCamera], cams: Array, matches: Matches
+) -> Array:
+    """Water rays (N, 6) in the rig, NaN where there is none.
+
+    Their origins are moved, along the rays, to where those of a camera nearly meet.
+    """
+    _, index, xy = matches
+    rays = np.full((len(xy), 6), np.nan)
+    for c, camera in enumerate(cameras):
+        rows = np.flatnonzero(index == c)
+        if not len(rows):
+            continue
+        origins, dirs = camera.ray_from_img(xy[rows])
+        centre = triangulate_tracks(origins, dirs, np.zeros(len(rows), np.int64), 1)[0]
+        if not np.isfinite(centre).all():  # a single ray, or none
+            centre = np.zeros(3)
+        along = np.einsum("ni,ni->n", centre - origins, dirs)
+        origins += along[:, None] * dirs
+        placed = cams[c].reshape(3, 4)
+        rays[rows, :3] = (origins - placed[:, 3]) @ placed[:, :3]
+        rays[rows, 3:] = dirs @ placed[:, :3]
+    return rays
+
+
+def _search(
+    rays: Array, matches: Matches, rig: RigRows, options: AbsolutePoseOptions
+) -> tuple[Array | None, int]:
+    """The best pose row (12,) of RANSAC, and the samples it took."""
+    rng = np.random.default_rng(options.seed)
+    limit = options.max_error_px**2
+    pose, best, inliers, trials = np.full(12, np.nan), np.inf, 0, 0
+    needed: float = options.max_trials
+    while trials < max(options.min_trials, min(needed, options.max_trials)):
+        samples = _draw(rng, matches[1])
+        best, found = search_pose(samples, rays, matches, rig, limit, best, pose)
+        trials += len(samples)
+        if found >= 0:
+            inliers = found
+        needed = trials_needed(inliers, len(rays), options.confidence)
+    return (pose if inliers >= options.min_num_inliers else None), trials
+
+
+def _draw(rng: np.random.Generator, camera_idx: IndexArray) -> IndexArray:
+    """Samples (CHUNK, 3) of different matches, of one camera each where it has three.
+
+    Args:
+        camera_idx: (N,) ascending.
+    """
+    u = rng.random((CHUNK, 3))
+    num = len(camera_idx)
+    first = (u[:, 0] * num).astype(np.int64)
+    low = np.searchsorted(camera_idx, camera_idx[first], side="left")
+    count = np.searchsorted(camera_idx, camera_idx[first], side="right") - low
+    few = count < 3
+    low[few], count[few] = 0, num
+    second = low + (u[:, 1] * (count - 1)).astype(np.int64)
+    second += second >= first
+    third = low + (u[:, 2] * (count - 2)).astype(np.int64)
+    third += third >= np.minimum(first, second)
+    third += third >= np.maximum(first, second)
+    return np.stack([first, second, third], axis=1)
+
+
+def _refined(
+    pose: Array,
+    matches: Matches,
+    rig: RigRows,
+    options: AbsolutePoseOptions,
+    num_trials: int,
+) -> RigPose | None:
+    """Robust adjustment, then least squares on what the noise explains."""
+    squares = np.empty(len(matches[1]))
+    pose = pose.copy()
+    limit = options.max_error_px**2
+    for loss in ("cauchy", "l2", "l2"):
+        squared_errors(pose, matches, rig, squares)
+        inliers = squares < limit
+        if np.count_nonzero(inliers) < options.min_num_inliers:
+            return None
+        noise = _noise_px(squares, inliers)
+        use = inliers
+        if loss == "l2":
+            use = inliers & (squares < (options.cut_stddevs * noise) ** 2)
+        _, hessian = refine_pose(
+            pose, matches, use, rig, LOSS_CODES[loss], noise, options.max_iterations
+        )
+    squared_errors(pose, matches, rig, squares)
+    inliers = squares < limit
+    num_inliers = int(np.count_nonzero(inliers))
+    if num_inliers < options.min_num_inliers:
+        return None
+    noise = _noise_px(squares, inliers)
+    rows = pose.reshape(3, 4)
+    return RigPose(
+        rig_from_world=rigid3.from_rotmat(rows[:, :3], rows[:, 3]),
+        inliers=inliers,
+        num_inliers=num_inliers,
+        errors_px=np.sqrt(squares),
+        noise_px=noise,
+        covariance=_covariance(hessian, noise),
+        num_trials=num_trials,
+    )
+
+
+def _noise_px(squares: Array, inliers: Mask) -> float:
+    median = float(np.sqrt(np.median(squares[inliers])))
+    return max(median / MEDIAN_ERROR, NOISE_FLOOR_PX)
+
+
+def _covariance(hessian: Array, noise_px: float) -> Array:
+    lower = np.tril(hessian)
+    full = lower + np.tril(hessian, -1).T
+    # In units of its own diagonal: rotations are radians, translations metres.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(full), 1e-300))
+    values, vectors = np.linalg.eigh(full * np.outer(scale, scale))
+    if not values[0] > 1e-12:
+        return np.full((6, 6), np.inf)
+    return noise_px**2 * ((vectors / values) @ vectors.T) * np.outer(scale, scale)
