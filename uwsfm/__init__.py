@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
     from uwsfm.pipeline import reconstruct
+    from uwsfm.refine_pipeline import refine_model
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
@@ -58,6 +59,7 @@ _HOMES = {
     "load_rig": "uwsfm.rig_file",
     "read_model": "uwsfm.export.files",
     "reconstruct": "uwsfm.pipeline",
+    "refine_model": "uwsfm.refine_pipeline",
 }
 
 __all__ = [
@@ -82,6 +84,7 @@ __all__ = [
     "predict_covariance",
     "read_model",
     "reconstruct",
+    "refine_model",
     "verdicts",
 ]
 

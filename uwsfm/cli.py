@@ -42,6 +42,24 @@ class Refinable(str, Enum):
     DISTORTION = "distortion"
 
 
+RefineOption = Annotated[
+    list[Refinable] | None,
+    typer.Option(
+        "--refine", help="Refine this too; may be repeated.", show_default=False
+    ),
+]
+PriorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KEY=VALUE",
+        help="What is known: distance_stddev_m, normal_stddev_deg, "
+        "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
+        "distortion_stddev; may be repeated.",
+        show_default=False,
+    ),
+]
+
+
 @app.callback()
 def _global_options(
     verbose: Annotated[
@@ -157,20 +175,8 @@ def calibrate(
             "1.333 f and radial distortion; or single stereo pairs, for normals only."
         ),
     ] = "virtual",
-    refine: Annotated[
-        list[Refinable] | None,
-        typer.Option(help="Refine this too; may be repeated.", show_default=False),
-    ] = None,
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY=VALUE",
-            help="What is known: distance_stddev_m, normal_stddev_deg, "
-            "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
-            "distortion_stddev; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
+    refine: RefineOption = None,
+    prior: PriorOption = None,
     matcher: Annotated[
         Literal["colmap", "paper"],
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
@@ -183,7 +189,6 @@ def calibrate(
     from uwsfm.housing_pipeline import calibrate_housing
     from uwsfm.sfm.options import MatchOptions, StartOptions
 
-    wanted = {f"refine_{what.value.replace('-', '_')}": True for what in refine or ()}
     front_end = StartOptions(
         matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
     )
@@ -197,11 +202,52 @@ def calibrate(
             progress=progress,
             strategy=strategy,
             error=error,
-            **wanted,
+            **_wanted(refine or ()),
             **_priors(prior or ()),
         )
     _print_housing(result)
     typer.echo(f"results in {out}")
+
+
+@app.command()
+def refine(
+    model: Annotated[
+        Path, typer.Argument(help="Folder of a COLMAP model of the raw images.")
+    ],
+    rig: Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the cameras' folders, for the points' colours."),
+    ] = None,
+    also: RefineOption = None,
+    prior: PriorOption = None,
+) -> None:
+    """Turn a COLMAP model that was made without refraction into the refractive one.
+
+    Any model of the raw images: text or binary, of any version, with or without rigs,
+    calibrated in the water or not; the lenses in air are those of the rig file.
+    """
+    from uwsfm.console import ProgressBars
+    from uwsfm.refine_pipeline import refine_model as run
+
+    with ProgressBars() as progress:
+        result = run(
+            model,
+            rig,
+            out,
+            images=images,
+            progress=progress,
+            **_wanted(also or ()),
+            **_priors(prior or ()),
+        )
+    _print_result(result.summary)
+    typer.echo(f"results in {out}")
+
+
+def _wanted(what: Iterable[Refinable]) -> dict[str, bool]:
+    """--refine, as fields of `CalibrateOptions`."""
+    return {f"refine_{item.value.replace('-', '_')}": True for item in what}
 
 
 def _priors(texts: Iterable[str]) -> dict[str, float]:

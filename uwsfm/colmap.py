@@ -35,7 +35,8 @@ class Model:
     frame_names: tuple[str, ...]
     """(F,) file names shared by the images of a frame."""
     keypoints: tuple[tuple[Array, ...], ...]
-    """[camera][frame] -> (n, 2) all keypoints of an image, pixels."""
+    """[camera][frame] -> (n, 2) all keypoints of an image, pixels; an image without
+    any is not there."""
     keypoint_idx: IndexArray
     """(N,) which keypoint of its image each observation is."""
     colors: NDArray[np.uint8]
@@ -115,9 +116,12 @@ def _add_frame(
     frame.rig_from_world = _rigid(scene.rig_from_world[index])
     images = []
     for camera in range(len(scene.cameras)):
+        keypoints = model.keypoints[camera][index]
+        if not len(keypoints):
+            continue
         image = pycolmap.Image(
             name=model.image_name(camera, index),
-            keypoints=model.keypoints[camera][index],
+            keypoints=keypoints,
             camera_id=camera + 1,
             image_id=1 + camera * scene.num_frames + index,
         )
@@ -144,12 +148,20 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Mo
     """The `Model` of a COLMAP model written by `to_reconstruction` and its rig.
 
     Raises:
-        InputError: an image is in no folder of the rig, or a frame is incomplete.
+        InputError: an image is in no folder of the rig, or a frame has no image.
     """
     frames = sorted(reconstruction.reg_frame_ids())
     images = _images_by_place(reconstruction, rig, frames)
-    prefix = len(rig.cameras[0].images) + 1
-    names = [images[0, f].name[prefix:] for f in range(len(frames))]
+    first = {f: c for c, f in sorted(images, reverse=True)}
+    names = [
+        images[first[f], f].name[len(rig.cameras[first[f]].images) + 1 :]
+        for f in range(len(frames))
+    ]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "images of equal names are in several frames of the COLMAP model: uwsfm "
+            "did not write it; uwsfm refine reads it"
+        )
     point_ids = sorted(reconstruction.points3D)
     point_of = {point_id: index for index, point_id in enumerate(point_ids)}
     place_of = {image.image_id: place for place, image in images.items()}
@@ -164,8 +176,12 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Mo
     world = [_params(reconstruction.frames[f].rig_from_world) for f in frames]
     cam_from_rig = [rigid3.IDENTITY]
     colmap_rig = reconstruction.rigs[reconstruction.frames[frames[0]].rig_id]
+    camera_id = {camera: image.camera_id for (camera, _), image in images.items()}
     for index in range(1, len(rig.cameras)):
-        lens = reconstruction.cameras[images[index, 0].camera_id]
+        if index not in camera_id:
+            name = rig.cameras[index].name
+            raise InputError(f"the COLMAP model has no image of camera {name}")
+        lens = reconstruction.cameras[camera_id[index]]
         cam_from_rig.append(_params(colmap_rig.sensor_from_rig(lens.sensor_id)))
     points = [reconstruction.points3D[i] for i in point_ids]
     return Model(
@@ -182,15 +198,19 @@ def from_reconstruction(reconstruction: pycolmap.Reconstruction, rig: Rig) -> Mo
         ),
         frame_names=tuple(names),
         keypoints=tuple(
-            tuple(
-                np.array([p.xy for p in images[c, f].points2D]).reshape(-1, 2)
-                for f in range(len(frames))
-            )
+            tuple(_keypoints(images.get((c, f))) for f in range(len(frames)))
             for c in range(len(rig.cameras))
         ),
         keypoint_idx=table[:, 3],
         colors=np.array([p.color for p in points], dtype=np.uint8).reshape(-1, 3),
     )
+
+
+def _keypoints(image: pycolmap.Image | None) -> Array:
+    """(n, 2) pixels, none of an image that is not there."""
+    if image is None:
+        return np.empty((0, 2))
+    return np.array([point.xy for point in image.points2D]).reshape(-1, 2)
 
 
 def _images_by_place(
@@ -209,10 +229,8 @@ def _images_by_place(
             if not cameras:
                 raise InputError(f"image {image.name} is in no folder of the rig")
             images[cameras[0], index] = image
-        missing = [c for c in range(len(rig.cameras)) if (c, index) not in images]
-        if missing:
-            name = rig.cameras[missing[0]].name
-            raise InputError(f"frame {frame_id} has no image of camera {name}")
+        if not any((c, index) in images for c in range(len(rig.cameras))):
+            raise InputError(f"frame {frame_id} of the COLMAP model has no image")
     return images
 
 
@@ -226,5 +244,5 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
         raise InputError(f"{path}: no such COLMAP model folder")
     try:
         return pycolmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
         raise InputError(f"{path}: not a COLMAP model: {error}") from None

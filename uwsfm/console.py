@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -94,6 +95,11 @@ def result_table(summary: dict[str, Any]) -> Table:
     table.add_row("invalid observations", f"{summary['num_invalid']}")
     table.add_row("true reprojection RMS before", f"{rms['before']:.3f} px")
     table.add_row("true reprojection RMS after", f"{rms['after']:.3f} px")
+    if "colmap_model" in summary:
+        own = summary["colmap_model"]["mean_error_of_kept_px"]
+        table.add_row("mean error", f"{summary['reprojection_mean_px']:.3f} px")
+        table.add_row("mean error of the COLMAP model, same points", f"{own:.3f} px")
+    _add_refined(table, summary.get("refined", ()))
     return table
 
 
@@ -108,10 +114,14 @@ def calibration_table(summary: dict[str, Any]) -> Table:
     table.add_row("observations", f"{summary['num_observations']}")
     rms = summary["reprojection_rms_px"]
     table.add_row("true reprojection RMS", f"{rms:.3f} px")
-    for entry in summary["refined"]:
+    _add_refined(table, summary["refined"])
+    return table
+
+
+def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
+    for entry in entries:
         stddev = _number(entry["stddev"], "{:.5g}")
         table.add_row(Text(entry["name"]), f"{entry['value']:.7g} ± {stddev}")
-    return table
 
 
 def budget_table(summary: dict[str, Any]) -> Table:

@@ -1,19 +1,17 @@
 """Housing calibration from images or from a COLMAP model: the housing, and no cloud."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import pycolmap
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.error_budget import BudgetRow, error_budget
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
-from uwsfm.colmap import from_reconstruction, read_reconstruction
 from uwsfm.errors import InputError
 from uwsfm.export.files import HOUSING, SPARSE
 from uwsfm.export.housing import export_housing
@@ -35,7 +33,9 @@ from uwsfm.pipeline import (
 )
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
+from uwsfm.sfm.colmap_model import find_model
 from uwsfm.sfm.images import find_frames
+from uwsfm.sfm.model_start import ModelStart, start_from_model
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.perspective import read_start
 from uwsfm.sfm.refine import refine_scene, rig_options
@@ -97,22 +97,23 @@ def calibrate_housing(
         )
     merged = {**rig_options(rig), **options}
     # A wrong option fails before anything is written.
-    _require_effect(CalibrateOptions.parsed(merged))
+    require_effect(CalibrateOptions.parsed(merged))
     source, out = Path(source), output_folder(out)
     if (out / SPARSE).exists():
         raise InputError(
             f"{out} holds a reconstruction, whose housing this would replace: choose "
             "another folder"
         )
-    model = _model_folder(source)
+    found = find_model(source)
     job = _Job(rig, source, out, start, front_end or StartOptions(), progress, merged)
-    if model is None:
+    if found is None:
         frames = find_frames(source, rig, min_num_frames=1)
         if start == "pairs" or len(frames.names) == 1:
             _require_distances_held(rig, merged, len(frames.names))
             job = replace(job, start="pairs")
     elif start == "pairs":
         raise InputError(f"{source} is a model: start 'pairs' works from images")
+    model = None if found is None else start_from_model(found, rig)
     with locked(out):
         return job.run(model)
 
@@ -129,43 +130,24 @@ class _Job:
     progress: Progress
     options: Mapping[str, Any]
 
-    def run(self, model: Path | None) -> HousingResult:
+    def run(self, model: ModelStart | None) -> HousingResult:
         if self.start == "pairs":
             calibration = self._from_pairs()
         else:
-            scene = self._from_images() if model is None else self._from_model(model)
+            scene = self._from_images() if model is None else model.scene
             if self.start == "paper":
                 scene, _ = perspective_adjustment(scene, loss="cauchy")
             options = dict(self.options)
             calibration = refine_scene(
                 scene, self.rig, self.progress, **options
             ).calibration
-        return self._finish(calibration)
+        return self._finish(calibration, () if model is None else model.warnings)
 
     def _from_images(self) -> Scene:
         start = perspective_start(
             self.rig, self.source, self.out / WORK, self.front_end, self.progress
         )
         return start_scene(self.rig, start, read_start(start))
-
-    def _from_model(self, folder: Path) -> Scene:
-        """The model's poses and tracks, scaled to the rig's baseline."""
-        reconstruction = read_reconstruction(folder)
-        _require_raw_images(folder, reconstruction, self.rig)
-        scene = from_reconstruction(reconstruction, self.rig).scene
-        baseline = np.linalg.norm(scene.cam_from_rig[1, 4:])
-        if not baseline > 0.0:
-            raise InputError(f"{folder}: the rig of the model has no baseline")
-        scale = self.rig.baseline_m / baseline
-        cam_from_rig = _scaled(scene.cam_from_rig, scale)
-        if self.rig.cam_from_rig is not None and not self.rig.refine_cam_from_rig:
-            cam_from_rig = self.rig.cam_from_rig
-        return replace(
-            scene,
-            cam_from_rig=cam_from_rig,
-            rig_from_world=_scaled(scene.rig_from_world, scale),
-            points=scale * scene.points,
-        )
 
     def _from_pairs(self) -> CalibrationResult:
         """Normals from single stereo pairs: section 3.2.1."""
@@ -188,12 +170,11 @@ class _Job:
             "distances were taken as given"
         ]
 
-    def _finish(self, calibration: CalibrationResult) -> HousingResult:
+    def _finish(
+        self, calibration: CalibrationResult, notes: Sequence[str]
+    ) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
-        rig = self.rig.with_geometry(scene.cam_from_rig, scene.ports)
-        lenses: list[Any] = [camera.camera for camera in scene.cameras]
-        pairs = zip(rig.cameras, lenses, strict=True)
-        rig = replace(rig, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
+        rig = refined_rig(self.rig, scene)
         budget = error_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
@@ -202,7 +183,11 @@ class _Job:
             **errors_summary(calibration),
             "cameras": housing_summary(rig, calibration),
             "refined": refined_summary(rig, calibration),
-            "warnings": self._notes() + housing_warnings(rig, calibration),
+            "warnings": [
+                *self._notes(),
+                *notes,
+                *housing_warnings(rig, calibration),
+            ],
             "error_budget": budget_summary(budget),
             "versions": versions(),
         }
@@ -232,7 +217,15 @@ def _require_distances_held(
         )
 
 
-def _require_effect(options: CalibrateOptions) -> None:
+def refined_rig(rig: Rig, scene: Scene) -> Rig:
+    """A rig with the poses, the ports and the lenses of a refined scene."""
+    found = rig.with_geometry(scene.cam_from_rig, scene.ports)
+    lenses: list[Any] = [camera.camera for camera in scene.cameras]
+    pairs = zip(found.cameras, lenses, strict=True)
+    return replace(found, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
+
+
+def require_effect(options: CalibrateOptions) -> None:
     """Refuse what is known of a number that is not refined."""
     refined = {
         "distance_stddev_m": ("the port distances", options.refine_distances),
@@ -248,34 +241,3 @@ def _require_effect(options: CalibrateOptions) -> None:
     for name, (what, wanted) in refined.items():
         if getattr(options, name) is not None and not np.any(wanted):
             raise InputError(f"{name} has no effect: {what} is not refined")
-
-
-def _require_raw_images(
-    folder: Path, reconstruction: pycolmap.Reconstruction, rig: Rig
-) -> None:
-    """Refuse models of undistorted or reduced images: their pixels are others."""
-    for image in reconstruction.images.values():
-        seen = reconstruction.cameras[image.camera_id]
-        for item in rig.cameras:
-            size = item.camera.width, item.camera.height
-            mine = image.name.startswith(f"{item.images}/")
-            if mine and (seen.width, seen.height) != size:
-                raise InputError(
-                    f"{folder}: image {image.name} has {seen.width} x {seen.height} "
-                    f"pixels there, camera {item.name!r} of the rig has {size[0]} x "
-                    f"{size[1]}: give a model of the raw images"
-                )
-
-
-def _model_folder(source: Path) -> Path | None:
-    """Where a COLMAP model is, in a folder that may be one or hold one."""
-    for folder in (source, source / SPARSE, source / SPARSE / "0"):
-        if any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
-            return folder
-    return None
-
-
-def _scaled(poses: np.ndarray, scale: float) -> np.ndarray:
-    scaled = poses.copy()
-    scaled[:, 4:] *= scale
-    return scaled

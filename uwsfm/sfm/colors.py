@@ -33,6 +33,8 @@ def point_colors(
     for camera, paths in enumerate(image_paths):
         for frame, path in enumerate(paths):
             rows = (scene.camera_idx == camera) & (scene.frame_idx == frame)
+            if not np.any(rows):  # nothing to colour: the image need not be there
+                continue
             image = cv2.imread(
                 str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
             )
