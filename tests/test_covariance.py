@@ -21,8 +21,7 @@ from uwsfm.solver.state import State
 
 def linearized(scene, options):
     at_zero = np.zeros(len(scene.cameras), dtype=bool)
-    models = [camera.camera.model_name for camera in scene.cameras]
-    layout = build_layout(scene, options.border_columns(models, at_zero))
+    layout = build_layout(scene, options.border_columns(scene.cameras, at_zero))
     return layout, likelihood(layout, State.from_scene(scene), None)
 
 

@@ -74,8 +74,8 @@ def problem_of(scene, error, loss, *, known):
     """A problem at the scene's state, all refined that the error determines."""
     lenses = LENSES if error == "reprojection" else {}
     settings = replace(KNOWN, refine_water_index=True, **lenses)
-    models = [camera.camera.model_name for camera in scene.cameras]
-    columns = settings.border_columns(models, np.zeros(len(models), dtype=bool))
+    none = np.zeros(len(scene.cameras), dtype=bool)
+    columns = settings.border_columns(scene.cameras, none)
     layout = build_layout(scene, columns)
     priors = None
     if known:

@@ -34,7 +34,7 @@ class Cell:
 
     def __init__(self, ports, rng, noise):
         self.point = rng.uniform((-0.3, -0.3, 1.0), (0.3, 0.3, 2.0))
-        self.ports = np.array([port.params for port in ports])
+        self.ports = np.array([port.row for port in ports])
         num = len(ports)
         quats = rigid3.quat_from_rotvec(0.1 * rng.normal(size=(num, 3)))
         shifts = 0.2 * np.arange(-1, num - 1)[:, None] * [1.0, 0.1, 0.05]
@@ -156,7 +156,7 @@ def test_jacobian_of_the_point_and_of_every_camera(ports, rng):
         check(jac[:, 6:8], _at(2, c, _tilted))
         steps = (1e-4, 1e-4, 1e-5, 1e-4)
         for column, slot, step in zip((8, 9, 10, 11), (3, 7, 4, 6), steps, strict=True):
-            shift = np.eye(8)[slot]
+            shift = np.eye(9)[slot]
             check(
                 jac[:, [column]], _at(2, c, lambda row, d, s=shift: row + d * s), step
             )
@@ -201,7 +201,7 @@ def _squinting(cell, angle):
     """Two cameras side by side, their axes turned outwards by an angle (radians)."""
     cell.cam_from_rig = np.array([rigid3.IDENTITY, rigid3.IDENTITY])
     cell.cam_from_rig[1, 4] = -0.2
-    cell.ports = np.array([FlatPort().params] * 2)
+    cell.ports = np.array([FlatPort().row] * 2)
     cell.dirs[2:4] = np.sin(angle), 0.0, np.cos(angle)
     cell.dirs[3, 0] *= -1.0
 
@@ -219,7 +219,7 @@ def test_cells_without_an_intersection_are_nan_with_their_reason(rng):
         cell.ports[0, :3] = -cell.ports[0, :3]
 
     def invert(cell):
-        cell.ports[1] = FlatPort(tilted(60, 0), n_air=1.5, n_water=1.0).params
+        cell.ports[1] = FlatPort(tilted(60, 0), n_air=1.5, n_water=1.0).row
 
     def blow_up(cell):
         cell.point[1] = np.nan

@@ -112,9 +112,9 @@ def test_light_takes_the_path_of_least_time(rng, port):
     points += 0.01 * height[:, None] * rng.normal(size=(10, 3))  # not only on its rays
     found, valid = camera.img_from_point(points)
     assert valid.all()
-    row = port.params
+    row = port.row
     for point, pixel in zip(points, found, strict=True):
-        ray = least_time_dir(point, row[:3], *row[3:])
+        ray = least_time_dir(point, row[:3], *row[3:8])
         # The oracle's gradient is zero to 1e-16, its curvature at least n / length.
         np.testing.assert_allclose(1000.0 * ray[:2] / ray[2], pixel, atol=2e-8)
 
@@ -127,9 +127,9 @@ def test_water_ray_is_that_of_the_papers_equations(rng, port):
     origins, dirs = camera.ray_from_img(xy)
     rays = np.column_stack([xy / 1000.0, np.ones(20)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    row = port.params
+    row = port.row
     for i, ray in enumerate(rays):
-        origin, direction = paper_water_ray(ray, row[:3], *row[3:])
+        origin, direction = paper_water_ray(ray, row[:3], *row[3:8])
         # At normal incidence arccos leaves the paper's formulas half of the digits.
         room = 3e-8 if i == 0 else 1e-12
         np.testing.assert_allclose(dirs[i], direction, atol=room, rtol=0)
@@ -223,7 +223,7 @@ def test_compiled_kernels_equal_their_python(port, rng):
     camera = RefractiveCamera(EXAMPLE_CAMERAS[4], port)
     points = rng.uniform([-1, -1, -0.5], [1, 1, 2], (60, 3))
     points[:3] = [[0, 0, 0], [np.nan, 0, 1], np.array(port.normal)]
-    lens, row = camera.lens, port.params
+    lens, row = camera.lens, port.row
     pixels = rng.uniform([-100, -100], [852, 580], (60, 2))
     for kernel, inputs in (
         (projection.project, points),
@@ -234,7 +234,7 @@ def test_compiled_kernels_equal_their_python(port, rng):
             slow = np.array(python_of(kernel)(*values, lens, row))
             np.testing.assert_allclose(fast, slow, rtol=1e-12)
             assert np.isnan(fast[1:]).all() == (fast[0] != Status.VALID)
-    fast, slow = np.full((2, 9), np.nan), np.full((2, 9), np.nan)
+    fast, slow = np.full((2, 10), np.nan), np.full((2, 10), np.nan)
     for values in points:
         first = projection.project_with_jac(*values, lens, row, fast)
         second = python_of(projection.project_with_jac)(*values, lens, row, slow)

@@ -59,7 +59,7 @@ def test_jacobian_of_every_block(camera, port, rng):
     assert len(xy) >= 4
     _, jac, valid = refractive.img_from_point_with_jac(points)
     assert valid.all()
-    start = (points, port.params)
+    start = (points, port.row)
 
     def check(columns, plus, step=1e-4):
         def pixels(x):
@@ -71,7 +71,7 @@ def test_jacobian_of_every_block(camera, port, rng):
     check(slice(3, 5), _with_normal)
     # Distance and thickness may pass through zero: the model is smooth there.
     for column, slot, step in ((5, 3, 1e-5), (6, 4, 1e-5), (7, 6, 1e-4), (8, 7, 1e-4)):
-        shift = np.eye(8)[slot]
+        shift = np.eye(9)[slot]
         check([column], lambda x, d, s=shift: (x[0], x[1] + d * s), step)
 
 

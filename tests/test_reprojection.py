@@ -7,6 +7,7 @@ from jacobians import CAMERA_IDS, EXAMPLE_CAMERAS, EXAMPLE_PORTS, check_jacobian
 from uwsfm import RefractiveCamera, Status
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.models.lens import lens_row, param_slots, with_limit
+from uwsfm.models.projection import JAC_SIZE
 from uwsfm.residuals.border import BORDER_SIZE, FIRST_LENS
 from uwsfm.residuals.reprojection import residual, residual_with_jac
 from uwsfm.solver.state import translation_arm
@@ -26,7 +27,7 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
     in_cam = origins[0] + 1.5 * dirs[0]
     point = rigid3.transform(rigid3.inverse(cam_from_rig), in_cam)
     lens = lens_row(camera.model_name, camera.params)
-    start = (point, cam_from_rig, port.params, lens)
+    start = (point, cam_from_rig, port.row, lens)
 
     def error(x):
         cam = rigid3.matrix_rows(x[1])
@@ -41,9 +42,9 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
         rigid3.matrix_rows(cam_from_rig),
         translation_arm(cam_from_rig[4:]),
         lens,
-        port.params,
+        port.row,
         True,
-        np.empty((2, 9)),
+        np.empty((2, JAC_SIZE)),
         j_rig,
         j_border,
     )

@@ -25,7 +25,6 @@ EVERYTHING = replace(
 )
 NUM_COLUMNS = 13 + 16
 NONE_AT_ZERO = np.zeros(2, dtype=bool)
-MODELS = ("OPENCV", "OPENCV")
 OFF = Perturbation(
     rotation_stddev_deg=0.3,
     translation_stddev=0.005,
@@ -35,7 +34,7 @@ OFF = Perturbation(
 
 
 def problem_of(scene, options=EVERYTHING, loss="l2", prior_weight=1e4):
-    layout = build_layout(scene, options.border_columns(MODELS, NONE_AT_ZERO))
+    layout = build_layout(scene, options.border_columns(scene.cameras, NONE_AT_ZERO))
     priors = None
     if options.baseline_stddev_m > 0.0:
         weights = np.zeros((2, BORDER_SIZE))
@@ -216,7 +215,7 @@ def test_layout_sorts_observations_and_holds_the_first_observed_frame(rng):
         xy=scene.xy[shuffled],
     ).select(keep)
     layout = build_layout(
-        scene, CalibrateOptions().border_columns(MODELS, NONE_AT_ZERO)
+        scene, CalibrateOptions().border_columns(scene.cameras, NONE_AT_ZERO)
     )
     assert layout.frame_col.tolist() == [HELD, HELD, 0, 6]
     held = np.array([False, False, True, False])

@@ -76,7 +76,7 @@ def test_nested_loops_end_near_the_joint_optimum_where_plain_repetition_would(er
     assert np.sqrt(np.mean(np.square(gaps))) < 0.35
 
     settings = CalibrateOptions(strategy="nested", error=error, loss="l2")
-    columns = settings.border_columns(["OPENCV"] * 2, np.zeros(2, dtype=bool))
+    columns = settings.border_columns(scene.cameras, np.zeros(2, dtype=bool))
     options = lm.LevenbergMarquardtOptions(error=error)
     loops = NestedLoops(build_layout(scene, columns), options)
     end = State.from_scene(found.scene)

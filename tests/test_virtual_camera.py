@@ -26,7 +26,7 @@ def python_of(kernel):
 
 
 def on_interface(point_in_cam, air_dir, port, sheet):
-    status, *error = residual(*point_in_cam, air_dir, UNMOVED, port.params, sheet)
+    status, *error = residual(*point_in_cam, air_dir, UNMOVED, port.row, sheet)
     assert status == Status.VALID
     return np.array(error)
 
@@ -119,7 +119,7 @@ def test_jacobian_of_the_point_the_camera_pose_and_the_housing(
     camera, port, sheet, rng
 ):
     point, air_dir, cam_from_rig = scene_row(camera, port, rng)
-    start = (point, cam_from_rig, port.params)
+    start = (point, cam_from_rig, port.row)
 
     def error(x):
         cam = rigid3.matrix_rows(x[1])
@@ -128,7 +128,7 @@ def test_jacobian_of_the_point_the_camera_pose_and_the_housing(
         return np.array(e)
 
     status, e, j_rig, j_border = with_jac(
-        point, air_dir, cam_from_rig, port.params, sheet
+        point, air_dir, cam_from_rig, port.row, sheet
     )
     assert status == Status.VALID
     # The same digits; only the order of the compiled sums may differ.
@@ -145,7 +145,7 @@ def test_jacobian_of_the_point_the_camera_pose_and_the_housing(
     # A distance is as small as 0.1 mm here: its differences pass through zero.
     steps = (1e-4, 1e-4, 1e-5, 1e-4)
     for column, slot, step in zip((8, 9, 10, 11), (3, 7, 4, 6), steps, strict=True):
-        shift = np.eye(8)[slot]
+        shift = np.eye(9)[slot]
         check(j_border[:, [column]], lambda x, d, s=shift: (*x[:2], x[2] + d * s), step)
 
 
@@ -172,7 +172,7 @@ def test_grows_with_the_scale_of_everything(port, sheet, rng):
     alone makes a smaller error, which a pixel does not."""
     point, air_dir, _ = scene_row(EXAMPLE_CAMERAS[1], port, rng)
     _, error, j_point, j_border = with_jac(
-        point, air_dir, rigid3.IDENTITY, port.params, sheet
+        point, air_dir, rigid3.IDENTITY, port.row, sheet
     )
     along_scale = j_point @ point
     along_scale += j_border[:, 8] * port.distance + j_border[:, 10] * port.thickness
@@ -183,8 +183,8 @@ def test_grows_with_the_scale_of_everything(port, sheet, rng):
 def test_interpreted_and_compiled_kernels_agree(port, rng):
     for camera, sheet in product(EXAMPLE_CAMERAS[:3], (SAGITTAL, TANGENTIAL)):
         row = scene_row(camera, port, rng)
-        fast = with_jac(*row, port.params, sheet)
-        slow = with_jac(*row, port.params, sheet, python_of(residual_with_jac))
+        fast = with_jac(*row, port.row, sheet)
+        slow = with_jac(*row, port.row, sheet, python_of(residual_with_jac))
         assert fast[0] == slow[0] == Status.VALID
         for compiled, interpreted in zip(fast[1:], slow[1:], strict=True):
             np.testing.assert_allclose(compiled, interpreted, rtol=1e-10, atol=1e-13)

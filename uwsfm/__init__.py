@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from uwsfm.export.files import export_colmap, export_ply, read_model
     from uwsfm.export.housing import export_housing
     from uwsfm.housing_pipeline import calibrate_housing
-    from uwsfm.models.port import FlatPort
+    from uwsfm.models.port import DomePort, FlatPort, NoPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
     from uwsfm.pipeline import reconstruct
@@ -39,7 +39,9 @@ logger.addHandler(logging.NullHandler())
 _HOMES = {
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
+    "DomePort": "uwsfm.models.port",
     "FlatPort": "uwsfm.models.port",
+    "NoPort": "uwsfm.models.port",
     "Model": "uwsfm.colmap",
     "Rig": "uwsfm.rig",
     "InputError": "uwsfm.errors",
@@ -65,9 +67,11 @@ _HOMES = {
 __all__ = [
     "CalibrateOptions",
     "CalibrationResult",
+    "DomePort",
     "FlatPort",
     "InputError",
     "Model",
+    "NoPort",
     "RefractiveCamera",
     "Rig",
     "Scene",

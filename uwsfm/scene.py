@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import Port
 from uwsfm.models.refractive import RefractiveCamera
 
 IndexArray = NDArray[np.int64]
@@ -116,7 +116,7 @@ class Scene:
         return len(self.xy)
 
     @property
-    def ports(self) -> tuple[FlatPort, ...]:
+    def ports(self) -> tuple[Port, ...]:
         return tuple(camera.port for camera in self.cameras)
 
     def points_in_cam(self) -> Array:

@@ -37,8 +37,8 @@ def table(case: Case = CASES[0], shown: tuple[int, ...] = SHOWN) -> list[Row]:
     end = uwsfm.calibrate(begin, loss="l2", strategy="nested")
     ends = np.array([port.distance for port in end.scene.ports])
     rows = [_row("root", end.summary.num_iterations, 0.0, time.perf_counter() - clock)]
-    models = [camera.camera.model_name for camera in begin.cameras]
-    layout = build_layout(begin, options.border_columns(models, np.zeros(2, bool)))
+    columns = options.border_columns(begin.cameras, np.zeros(2, bool))
+    layout = build_layout(begin, columns)
     solver = LevenbergMarquardtOptions(error=options.error_name)
     loops, state = NestedLoops(layout, solver), State.from_scene(begin)
     clock, steps = time.perf_counter(), 0

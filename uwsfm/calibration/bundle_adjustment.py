@@ -1,6 +1,7 @@
 """Housing calibration: one joint bundle adjustment of everything that is unknown.
 
-Rig poses, cam_from_rig, port normals and distances and the points move together on the
+Rig poses, cam_from_rig, port normals and distances (or domes' centres) and the points
+move together on the
 reprojection error in true pixels. Staging (normals first, then distances) converges
 less often, and the nested scheme of Sedlazeck & Koch (BMVC 2011, fig. 5), which is
 `strategies.minimize_nested`, reaches no better optimum, far slower.
@@ -23,6 +24,8 @@ from uwsfm.calibration.strategies import STRATEGIES
 from uwsfm.calibration.uncertainty import Optimum, posterior_covariance
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rays import finite_rows
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DOME, FLAT, KIND, FlatPort, NoPort
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import (
@@ -104,11 +107,15 @@ def _check(scene: Scene, settings: CalibrateOptions) -> None:
             f"error 'point_3d' tells nothing from {frames} frame: its points can be "
             "where the rays meet, whatever the ports; add frames or use another error"
         )
-    indices = {port.n_water for port in scene.ports}
-    if settings.refine_water_index and len(indices) > 1:
+    if settings.refine_water_index and all(
+        isinstance(port, NoPort) for port in scene.ports
+    ):
+        raise InputError("refine_water_index: no camera is behind a port")
+    other = [c for c, p in enumerate(scene.ports) if not isinstance(p, FlatPort)]
+    if other and settings.error_name != "reprojection":
         raise InputError(
-            "refine_water_index refines one index for all ports, but they start from "
-            f"n_water = {', '.join(str(index) for index in sorted(indices))}"
+            f"error {settings.error_name!r} is defined for flat ports, camera "
+            f"{other[0]} has {scene.ports[other[0]]}: use the reprojection error"
         )
     finite = finite_rows(scene.points)[scene.point_idx]
     if not np.all(finite):
@@ -191,8 +198,7 @@ class _Run:
 
     @property
     def columns(self) -> IndexArray:
-        models = [camera.camera.model_name for camera in self.scene.cameras]
-        return self.settings.border_columns(models, self.at_zero)
+        return self.settings.border_columns(self.scene.cameras, self.at_zero)
 
     def solve(
         self, start: State, keep: NDArray[np.bool_], loss: str, sigma_px: float = 1.0
@@ -204,14 +210,14 @@ class _Run:
         """
         self.at_zero[:] = False
         solved = self._solve_free(start, keep, loss, sigma_px)
-        while np.any(negative := solved.state.ports[:, 3] < 0.0):
+        while np.any(negative := _behind_camera(solved.state.ports)):
             self.at_zero |= negative
             ports = solved.state.ports.copy()
             ports[self.at_zero, 3] = 0.0
             solved = self._solve_free(
                 replace(solved.state, ports=ports), keep, loss, sigma_px
             )
-        _check_normals(solved.state)
+        _check_ports(solved.state)
         return solved
 
     def _solve_free(
@@ -258,9 +264,21 @@ class _Run:
         return border_priors(self.known, self.settings, self.columns, sigma_px)
 
 
-def _check_normals(state: State) -> None:
+def _behind_camera(ports: Array) -> NDArray[np.bool_]:
+    """Mask (C,) of the flat ports whose distance is negative."""
+    return (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
+
+
+def _check_ports(state: State) -> None:
     for camera, row in enumerate(state.ports):
-        if not row[2] > 0.0:
+        offset = float(np.linalg.norm(row[:3]))
+        if row[KIND] == DOME and not offset < row[3]:
+            raise UwsfmError(
+                f"the dome of camera {camera} moved away, to a centre {offset:.3f} m "
+                f"from the camera at a radius of {row[3]:.3f} m: the start is too far "
+                "off, or the images do not determine the centre"
+            )
+        if row[KIND] == FLAT and not row[2] > 0.0:
             raise UwsfmError(
                 f"the port normal of camera {camera} turned away from the water, to "
                 f"({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the start is too far off "

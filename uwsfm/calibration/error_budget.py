@@ -14,6 +14,7 @@ from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.calibration.uncertainty import likelihood
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver import schur
@@ -32,6 +33,8 @@ class Shift:
     distance_m: float
     normal: tuple[float, float, float]
     """Change of the port normal; its length is the angle in radians."""
+    center_m: tuple[float, float, float]
+    """Change of a dome's centre."""
 
     @property
     def tilt_deg(self) -> float:
@@ -62,9 +65,10 @@ def error_budget(result: CalibrationResult) -> tuple[BudgetRow, ...]:
     """
     scene, settings = result.scene.select(result.inliers)[0], result.options
     changes = _standard_changes(scene)
-    models = [camera.camera.model_name for camera in scene.cameras]
-    at_zero = np.array([port.distance == 0.0 for port in scene.ports])
-    columns = settings.border_columns(models, at_zero)
+    at_zero = np.array(
+        [isinstance(port, FlatPort) and port.distance == 0.0 for port in scene.ports]
+    )
+    columns = settings.border_columns(scene.cameras, at_zero)
     moved = _propagate(scene, settings, columns, np.stack(list(changes.values())))
     rows = [
         BudgetRow(name=name, shifts=_shifts(scene, step))
@@ -74,6 +78,7 @@ def error_budget(result: CalibrationResult) -> tuple[BudgetRow, ...]:
         Shift(
             distance_m=float(np.sqrt(sum(r.shifts[c].distance_m ** 2 for r in rows))),
             normal=_root_sum([r.shifts[c].normal for r in rows]),
+            center_m=_root_sum([r.shifts[c].center_m for r in rows]),
         )
         for c in range(len(scene.cameras))
     )
@@ -81,8 +86,7 @@ def error_budget(result: CalibrationResult) -> tuple[BudgetRow, ...]:
 
 
 def _root_sum(vectors: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-    x, y, z = np.sqrt(np.sum(np.square(vectors), axis=0)).tolist()
-    return x, y, z
+    return _triple(np.sqrt(np.sum(np.square(vectors), axis=0)))
 
 
 def _standard_changes(scene: Scene) -> dict[str, Array]:
@@ -96,15 +100,21 @@ def _standard_changes(scene: Scene) -> dict[str, Array]:
         return step
 
     lengths = np.linalg.norm(scene.cam_from_rig[:, 4:], axis=1)
-    return {
+    domes = [isinstance(port, DomePort) for port in scene.ports]
+    water = [not isinstance(port, NoPort) for port in scene.ports]
+    changes = {
         "focal length +0.1 %": change([FOCAL, FOCAL + 1], 1e-3 * lenses[:, :2]),
         "principal point +1 px in x": change(CX, 1.0),
         "principal point +1 px in y": change(CY, 1.0),
-        "water index +0.01": change(border.WATER_INDEX, 0.01),
-        "glass index +0.01": change(border.GLASS_INDEX, 0.01),
-        "glass thickness +2 mm": change(border.THICKNESS, 2e-3),
-        "baseline +1 %": change(border.LENGTH, 0.01 * lengths),
+        "water index +0.01": change(border.WATER_INDEX, 0.01 * np.array(water)),
+        "glass index +0.01": change(border.GLASS_INDEX, 0.01 * np.array(water)),
+        "glass thickness +2 mm": change(border.THICKNESS, 2e-3 * np.array(water)),
     }
+    if any(domes):
+        changes["dome radius +1 mm"] = change(border.RADIUS, 1e-3 * np.array(domes))
+    if np.any(lengths > 0.0):
+        changes["baseline +1 %"] = change(border.LENGTH, 0.01 * lengths)
+    return changes
 
 
 def _propagate(
@@ -148,9 +158,19 @@ def _sigma(scene: Scene, num_unknowns: int) -> float:
 
 def _shifts(scene: Scene, step: Array) -> tuple[Shift, ...]:
     shifts = []
-    for camera, row in zip(scene.cameras, step, strict=True):
-        turn = unit_vector.tangent_basis(camera.port.normal) @ row[border.NORMAL]
-        x, y, z = turn.tolist()
-        distance = float(row[border.DISTANCE])
-        shifts.append(Shift(distance_m=distance, normal=(x, y, z)))
+    for port, row in zip(scene.ports, step, strict=True):
+        turn, center, distance = np.zeros(3), np.zeros(3), 0.0
+        if isinstance(port, FlatPort):
+            turn = unit_vector.tangent_basis(port.normal) @ row[border.NORMAL]
+            distance = float(row[border.DISTANCE])
+        elif isinstance(port, DomePort):
+            center = row[border.CENTER]
+        shifts.append(
+            Shift(distance_m=distance, normal=_triple(turn), center_m=_triple(center))
+        )
     return tuple(shifts)
+
+
+def _triple(vector: Array) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z

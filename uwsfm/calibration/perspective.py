@@ -13,11 +13,9 @@ import numpy as np
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import CalibrateSummary
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
-
-NO_PORT = FlatPort(distance=0.0, thickness=0.0, n_glass=1.0, n_water=1.0)
 
 
 def perspective_adjustment(
@@ -45,7 +43,7 @@ def perspective_adjustment(
     for index, camera in enumerate(scene.cameras):
         rows = scene.camera_idx == index
         pinholes.append(_pinhole(camera))
-        _, dirs = RefractiveCamera(camera.camera, NO_PORT).ray_from_img(scene.xy[rows])
+        _, dirs = RefractiveCamera(camera.camera, NoPort()).ray_from_img(scene.xy[rows])
         focal = np.sqrt(camera.lens[0] * camera.lens[1])
         xy[rows] = focal * dirs[:, :2] / dirs[:, 2:] + camera.lens[2:4]
     seen = finite_rows(xy)
@@ -80,4 +78,4 @@ def _pinhole(camera: RefractiveCamera) -> RefractiveCamera:
         height=camera.height,
         params=[focal, lens[2], lens[3], 0.0, 0.0],
     )
-    return RefractiveCamera(pinhole, NO_PORT)
+    return RefractiveCamera(pinhole, NoPort())

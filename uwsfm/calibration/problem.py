@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
+from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.error_models import ERROR_CODES
@@ -58,11 +60,17 @@ class CalibrateOptions:
     the strategy's own, reprojection if joint, virtual_camera in the outer loop if
     nested."""
     refine_normals: PerCamera = True
+    """Of flat ports."""
     refine_distances: PerCamera = True
+    """Of flat ports."""
+    refine_centers: PerCamera = True
+    """Of domes, all three coordinates."""
     refine_cam_from_rig: bool = True
     """Rotations and the directions of the translations."""
     refine_water_index: bool = False
-    """One index shared by all ports."""
+    """Shared by all ports that start from the same index."""
+    separate_water_index: bool = False
+    """Every port refines an index of its own."""
     refine_focal: bool = False
     """Focal lengths of every camera; they trade against water index and distance."""
     refine_principal_point: bool = False
@@ -156,39 +164,60 @@ class CalibrateOptions:
         return self.error or DEFAULT_ERRORS[self.strategy]
 
     def border_columns(
-        self, models: Sequence[str], at_zero: NDArray[np.bool_]
+        self, cameras: Sequence[RefractiveCamera], at_zero: NDArray[np.bool_]
     ) -> IndexArray:
         """(C, BORDER_SIZE) columns of what is refined, HELD for the rest.
 
         Args:
-            models: COLMAP names of the C lenses.
+            cameras: C of them; their lenses and kinds of port have different parameters.
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
-        count = len(at_zero)
+        count, ports = len(at_zero), [camera.port for camera in cameras]
+        flat = np.array([isinstance(port, FlatPort) for port in ports])
+        dome = np.array([isinstance(port, DomePort) for port in ports])
         normals = _per_camera("refine_normals", self.refine_normals, count)
         distances = _per_camera("refine_distances", self.refine_distances, count)
+        centers = _per_camera("refine_centers", self.refine_centers, count)
         free = np.zeros((count, border.BORDER_SIZE), dtype=bool)
         free[1:, border.ROTATION] = self.refine_cam_from_rig
         free[1:, border.DIRECTION] = self.refine_cam_from_rig
         free[1:, border.LENGTH] = self.baseline_stddev_m > 0.0
-        free[:, border.NORMAL] = normals[:, None]
-        free[:, border.DISTANCE] = distances & ~at_zero
+        free[:, border.NORMAL] = (normals & flat)[:, None]
+        free[:, border.DISTANCE] = distances & flat & ~at_zero
+        free[dome, border.CENTER] = centers[dome, None]
         wanted = np.zeros(NUM_PARAMS, dtype=bool)
         wanted[:2] = self.refine_focal
         wanted[2:4] = self.refine_principal_point
         wanted[4:] = self.refine_distortion
+        models = [camera.camera.model_name for camera in cameras]
         for c, model in enumerate(models):
             for slot in param_slots(model):
                 free[c, border.FIRST_LENS + slot] = wanted[slot]
-        free[0, border.WATER_INDEX] = self.refine_water_index
+        water = self._first_of_water(ports)
+        for c, first in enumerate(water):
+            free[c, border.WATER_INDEX] = self.refine_water_index and c == first
         columns = np.full(free.shape, HELD, dtype=np.int64)
         columns[free] = np.arange(np.count_nonzero(free))
-        columns[:, border.WATER_INDEX] = columns[0, border.WATER_INDEX]
+        for c, first in enumerate(water):
+            if first is not None:
+                columns[c, border.WATER_INDEX] = columns[first, border.WATER_INDEX]
         for c, model in enumerate(models):
             if 1 not in param_slots(model):  # one focal length for both axes
                 fx = columns[c, border.FIRST_LENS]
                 columns[c, border.FIRST_LENS + 1] = fx
         return columns
+
+    def _first_of_water(self, ports: Sequence[Port]) -> list[int | None]:
+        """The first port that shares each port's water; None: no refraction."""
+        first: dict[float, int] = {}
+        return [
+            None
+            if isinstance(port, NoPort)
+            else c
+            if self.separate_water_index
+            else first.setdefault(port.n_water, c)
+            for c, port in enumerate(ports)
+        ]
 
 
 def _one_of(name: str, value: str, allowed: Iterable[str]) -> None:
@@ -222,6 +251,8 @@ class CameraCovariance:
     """Root mean square angle of cam_from_rig's rotation."""
     translation_stddev_m: tuple[float, float, float]
     """Of cam_from_rig's translation; its length adds only if it is not held."""
+    center_stddev_m: tuple[float, float, float]
+    """Of a dome's centre, x, y, z in the camera frame."""
     distance_at_zero: bool
     """The images wanted a negative port distance, which no housing has: it was held at
     zero. They contradict the lens or the water index that was given."""
@@ -233,8 +264,9 @@ class Covariance:
 
     The parameters of a camera are those of `uwsfm.residuals.border`, in its order:
     rotation of cam_from_rig (3, left tangent, radians), direction of its translation
-    (2, tangent), its length (metres), port normal (2, tangent), port distance (metres),
-    water index, glass thickness, glass index, and the lens. The covariance is that of
+    (2, tangent), its length (metres), port normal (2, tangent) and port distance
+    (metres) or the centre of a dome (3, metres), water index, glass thickness, glass
+    index, radius of a dome, and the lens. The covariance is that of
     the maximum likelihood: another error than reprojection scatters at least so much.
     """
 

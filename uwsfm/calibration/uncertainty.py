@@ -10,6 +10,7 @@ from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DOME, KIND, DomePort
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.clustered import clustered_covariance
@@ -77,7 +78,10 @@ def _posterior_covariance(optimum: Optimum) -> Covariance:
     cameras = []
     for camera, pose in enumerate(optimum.state.cam_from_rig):
         cols, at_zero = optimum.columns[camera], bool(optimum.at_zero[camera])
-        alone, together = (camera_variances(b, cols, pose) for b in (border, shared))
+        dome = bool(optimum.state.ports[camera, KIND] == DOME)
+        alone, together = (
+            camera_variances(b, cols, pose, dome) for b in (border, shared)
+        )
         # Sampling noise can make the second one smaller: then the first is the truth.
         cameras.append(_camera_covariance(np.maximum(alone, together), at_zero))
     return Covariance(
@@ -113,8 +117,7 @@ def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covaria
         )
     scene = replace(scene, xy=pixels)
     at_zero = np.zeros(len(scene.cameras), dtype=bool)
-    models = [camera.camera.model_name for camera in scene.cameras]
-    columns = settings.border_columns(models, at_zero)
+    columns = settings.border_columns(scene.cameras, at_zero)
     layout, state = build_layout(scene, columns), State.from_scene(scene)
     priors = border_priors(scene, settings, columns, noise_px)
     eqs = likelihood(layout, state, priors)
@@ -127,8 +130,12 @@ def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covaria
         frames=variance * reduced.frames(layout),
         points=variance * point_covariances(layout, eqs, reduced),
         cameras=tuple(
-            _camera_covariance(camera_variances(border, cols, pose), False)
-            for cols, pose in zip(columns, scene.cam_from_rig, strict=True)
+            _camera_covariance(
+                camera_variances(border, cols, pose, isinstance(port, DomePort)), False
+            )
+            for cols, pose, port in zip(
+                columns, scene.cam_from_rig, scene.ports, strict=True
+            )
         ),
         determined=reduced.determined,
     )
@@ -170,11 +177,14 @@ def _clusters(optimum: Optimum) -> IndexArray:
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def camera_variances(border: Array, cols: IndexArray, cam_from_rig: Array) -> Array:
-    """Variances (6,) of one camera from the border's covariance.
+def camera_variances(
+    border: Array, cols: IndexArray, cam_from_rig: Array, dome: bool = False
+) -> Array:
+    """Variances (9,) of one camera from the border's covariance.
 
     Of the angle of the normal and the port distance, of the rotation angle of
-    cam_from_rig, and of its translation's x, y, z; radians and metres, squared.
+    cam_from_rig, of its translation's x, y, z, and of the dome's centre x, y, z;
+    radians and metres, squared. What the kind of port does not have is zero.
     """
     padded = np.zeros((len(border) + 1, len(border) + 1))
     padded[:-1, :-1] = border  # HELD = -1 reads the zeros at the end
@@ -185,15 +195,20 @@ def camera_variances(border: Array, cols: IndexArray, cam_from_rig: Array) -> Ar
         np.trace(block[part, part]) for part in (border_of.ROTATION, border_of.NORMAL)
     )
     distance = block[border_of.DISTANCE, border_of.DISTANCE]
-    return np.array([normal, distance, rotation, *translation])
+    center = np.zeros(3)
+    if dome:
+        center = np.diag(block[border_of.CENTER, border_of.CENTER])
+        normal = distance = 0.0
+    return np.array([normal, distance, rotation, *translation, *center])
 
 
 def _camera_covariance(variances: Array, at_zero: bool) -> CameraCovariance:
-    normal, distance, rotation, x, y, z = np.sqrt(variances).tolist()
+    normal, distance, rotation, x, y, z, *center = np.sqrt(variances).tolist()
     return CameraCovariance(
         normal_stddev_deg=float(np.degrees(normal)),
         distance_stddev_m=distance,
         rotation_stddev_deg=float(np.degrees(rotation)),
         translation_stddev_m=(x, y, z),
+        center_stddev_m=(center[0], center[1], center[2]),
         distance_at_zero=at_zero,
     )

@@ -1,4 +1,4 @@
-"""`RefractiveCamera`: a lens in air behind a flat port in water."""
+"""`RefractiveCamera`: a lens in air behind a port in water."""
 
 import copy
 from typing import Any, Protocol
@@ -11,7 +11,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models import projection
 from uwsfm.models.caustic import caustic_points
 from uwsfm.models.lens import SUPPORTED_MODELS, lens_row, param_slots
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import FlatPort, Port
 from uwsfm.models.status import VALID
 
 StatusArray = NDArray[np.uint8]
@@ -41,26 +41,29 @@ def _rows(name: str, values: ArrayLike, columns: int) -> Array:
 
 
 class RefractiveCamera:
-    """A camera, calibrated in air, that looks through a flat port into water.
+    """A camera, calibrated in air, that looks through a port into water.
 
     Every COLMAP camera model unprojects; the models in `lens.SUPPORTED_MODELS` project
     as well and have Jacobians.
 
     Args:
         camera: a `pycolmap.Camera` with in-air intrinsics.
-        port: the window, in the camera frame.
+        port: the window, in the camera frame; or `NoPort`.
 
     Raises:
         InputError: the camera's parameters are not usable.
     """
 
-    def __init__(self, camera: InAirCamera, port: FlatPort) -> None:
+    def __init__(self, camera: InAirCamera, port: Port) -> None:
         if not hasattr(camera, "model_name"):
             raise InputError(f"camera must be a pycolmap.Camera, got {camera!r}")
-        if not isinstance(port, FlatPort):
-            raise InputError(f"port must be a FlatPort, got {port!r}")
+        if not isinstance(port, Port):
+            raise InputError(
+                f"port must be a FlatPort, a DomePort or NoPort(), got {port!r}"
+            )
         self._camera = camera
         self._port = port
+        self._row = port.row
         self._lens = None
         if camera.model_name in SUPPORTED_MODELS:
             self._lens = lens_row(camera.model_name, camera.params)
@@ -74,7 +77,7 @@ class RefractiveCamera:
         return self._camera
 
     @property
-    def port(self) -> FlatPort:
+    def port(self) -> Port:
         return self._port
 
     @property
@@ -96,7 +99,7 @@ class RefractiveCamera:
             return lens_row(self._camera.model_name, self._camera.params)
         return self._lens
 
-    def with_port(self, port: FlatPort) -> "RefractiveCamera":
+    def with_port(self, port: Port) -> "RefractiveCamera":
         """The same lens behind another port."""
         return RefractiveCamera(self._camera, port)
 
@@ -135,7 +138,14 @@ class RefractiveCamera:
             The sagittal focal points, all on the axis through the camera along the
             port's normal, and the tangential ones; (N, 3) each, in the camera frame,
             NaN where the pixel has no ray.
+
+        Raises:
+            InputError: the port is not flat.
         """
+        if not isinstance(self._port, FlatPort):
+            raise InputError(
+                f"the caustic is known of flat ports only, not of {self._port}"
+            )
         return caustic_points(*self.ray_from_img(xy), self._port)
 
     def img_from_point(self, points_in_cam: ArrayLike) -> tuple[Array, Mask]:
@@ -164,16 +174,16 @@ class RefractiveCamera:
         """`img_from_point`, with its Jacobian.
 
         Returns:
-            Pixels (N, 2), the Jacobian (N, 2, 9) and ``valid`` (N,). The columns are:
-            point (3), normal (2, in `unit_vector.tangent_basis`), distance, thickness,
-            n_glass, n_water.
+            Pixels (N, 2), the Jacobian (N, 2, 10) and ``valid`` (N,). The columns are:
+            point (3); normal (2, in `unit_vector.tangent_basis`) and distance, or the
+            centre (3) of a dome; thickness, n_glass, n_water; radius of a dome.
         """
         points = _rows("points_in_cam", points_in_cam, 3)
         xy = np.empty((len(points), 2))
         jac = np.empty((len(points), 2, projection.JAC_SIZE))
         status = np.empty(len(points), dtype=np.uint8)
         projection.project_with_jac_batch(
-            points, self.lens, self._port.params, xy, jac, status
+            points, self.lens, self._row, xy, jac, status
         )
         return xy, jac, status == VALID
 
@@ -181,20 +191,19 @@ class RefractiveCamera:
         points = _rows("points_in_cam", points_in_cam, 3)
         xy = np.empty((len(points), 2))
         status = np.empty(len(points), dtype=np.uint8)
-        projection.project_batch(points, self.lens, self._port.params, xy, status)
+        projection.project_batch(points, self.lens, self._row, xy, status)
         return xy, status
 
     def _unproject(self, xy: ArrayLike) -> tuple[Array, StatusArray]:
         pixels = _rows("xy", xy, 2)
         rays = np.empty((len(pixels), 6))
         status = np.empty(len(pixels), dtype=np.uint8)
-        params = self._port.params
         if self._lens is not None:
-            projection.unproject_batch(pixels, self._lens, params, rays, status)
+            projection.unproject_batch(pixels, self._lens, self._row, rays, status)
             return rays, status
         dirs = np.full((len(pixels), 3), np.nan)
         finite = np.all(np.isfinite(pixels), axis=1)
         dirs[finite] = self._camera.cam_ray_from_img(pixels[finite])
-        projection.refract_batch(dirs, params, rays, status)
+        projection.refract_batch(dirs, self._row, rays, status)
         status[~finite] = projection.NOT_FINITE
         return rays, status

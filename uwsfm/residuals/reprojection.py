@@ -5,7 +5,7 @@ import math
 from uwsfm._jit import kernel
 from uwsfm.models.projection import lens_jac_of_point, project, project_with_jac
 from uwsfm.models.status import VALID
-from uwsfm.residuals.border import FIRST_LENS
+from uwsfm.residuals.border import FIRST_LENS, RADIUS
 
 
 @kernel
@@ -41,7 +41,7 @@ def residual_with_jac(
             columns, one after the other.
         lens, port: rows of the models.
         free_lens: whether the lens columns are wanted: they cost a second refraction.
-        j_port: (2, 9) scratch.
+        j_port: (2, JAC_SIZE) scratch.
         j_rig: (2, 3), written.
         j_border: (2, BORDER_SIZE), written.
 
@@ -74,4 +74,5 @@ def residual_with_jac(
         j_border[i, 9] = j_port[i, 8]
         j_border[i, 10] = j_port[i, 6]
         j_border[i, 11] = j_port[i, 7]
+        j_border[i, RADIUS] = j_port[i, 9]
     return status, u - xy[0], v - xy[1]

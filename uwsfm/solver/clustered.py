@@ -14,6 +14,7 @@ import numpy as np
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.projection import JAC_SIZE
 from uwsfm.models.status import VALID
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
@@ -51,7 +52,7 @@ def _add_score(layout, eqs, p, col, torque_force, pull, border, camera, offset, 
 @kernel
 def _scores(layout, state, eqs, inverses, cluster, offset, out):
     """Sum J~^T r of each cluster into out (clusters, n); squared loss."""
-    j_port, j_rig = np.empty((2, 9)), np.empty((2, 3))
+    j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
     j_border = np.zeros((2, BORDER_SIZE))
     force, grad = np.empty(6), np.empty(BORDER_SIZE)
     for p in range(len(layout.point_start) - 1):

@@ -15,6 +15,7 @@ import numpy as np
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.projection import JAC_SIZE
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig, residual
 from uwsfm.solver.cells import (
@@ -153,7 +154,7 @@ def _work(num_border, num_cameras, largest_cell):
         np.zeros((num_cameras, BORDER_SIZE, BORDER_SIZE)),
         np.zeros((num_cameras, BORDER_SIZE)),
         np.empty((2, BORDER_SIZE)),
-        np.empty((2, 9)),
+        np.empty((2, JAC_SIZE)),
         np.zeros((4, 3)),  # a virtual camera's error has three rows and one of zeros
         np.zeros((4, BORDER_SIZE)),
         np.zeros((largest_cell, 3, BORDER_SIZE)),

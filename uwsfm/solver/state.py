@@ -8,18 +8,18 @@ import numpy as np
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, with_limit
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import DOME, KIND, port_from_row
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout
 
-# Columns of a port's row that simply add.
+# Columns of a port's row that simply add, whatever its kind.
 PORT_COLUMNS = {
-    border.DISTANCE: 3,
     border.THICKNESS: 4,
     border.GLASS_INDEX: 6,
     border.WATER_INDEX: 7,
 }
+RADIUS_OR_DISTANCE = 3
 
 
 class KernelState(NamedTuple):
@@ -57,7 +57,7 @@ class State:
         return cls(
             rig_from_world=scene.rig_from_world,
             cam_from_rig=scene.cam_from_rig,
-            ports=np.array([port.params for port in scene.ports]),
+            ports=np.array([port.row for port in scene.ports]),
             points=scene.points,
             lenses=np.array([camera.lens for camera in scene.cameras]),
         )
@@ -69,7 +69,7 @@ class State:
             InputError: a port is not physical (a negative distance, say).
         """
         cameras = tuple(
-            camera.with_port(FlatPort.from_params(port)).with_lens(lens)
+            camera.with_port(port_from_row(port)).with_lens(lens)
             for camera, port, lens in zip(
                 scene.cameras, self.ports, self.lenses, strict=True
             )
@@ -107,7 +107,7 @@ class State:
         cam_from_rig, ports = self.cam_from_rig.copy(), self.ports.copy()
         for c, delta in enumerate(deltas):
             cam_from_rig[c] = _moved_camera(cam_from_rig[c], delta)
-            ports[c, :3] = unit_vector.plus(ports[c, :3], delta[border.NORMAL])
+            ports[c, :4] = _moved_interface(ports[c], delta)
         for slot, column in PORT_COLUMNS.items():
             ports[:, column] += deltas[:, slot]
         lenses = self.lenses
@@ -131,9 +131,14 @@ class State:
         """
         difference = np.zeros((len(self.ports), border.BORDER_SIZE))
         difference[:, border.LENGTH] = self.baselines - reference.baselines
-        for c, normal in enumerate(self.ports[:, :3]):
-            away = -unit_vector.minus(reference.ports[c, :3], normal)
-            difference[c, border.NORMAL] = away
+        for c, (port, other) in enumerate(zip(self.ports, reference.ports, strict=True)):
+            beyond = port[RADIUS_OR_DISTANCE] - other[RADIUS_OR_DISTANCE]
+            if port[KIND] == DOME:
+                difference[c, border.CENTER] = port[:3] - other[:3]
+                difference[c, border.RADIUS] = beyond
+            else:
+                difference[c, border.NORMAL] = -unit_vector.minus(other[:3], port[:3])
+                difference[c, border.DISTANCE] = beyond
         for slot, column in PORT_COLUMNS.items():
             difference[:, slot] = self.ports[:, column] - reference.ports[:, column]
         difference[:, border.LENS] = (
@@ -156,6 +161,14 @@ def translation_arm(translation: Array) -> Array:
     direction = translation / length
     sideways = length * unit_vector.tangent_basis(direction).T
     return np.concatenate([sideways.ravel(), direction])
+
+
+def _moved_interface(port: Array, delta: Array) -> Array:
+    """First four numbers of a port: normal and distance, or centre and radius."""
+    if port[KIND] == DOME:
+        return port[:4] + np.append(delta[border.CENTER], delta[border.RADIUS])
+    normal = unit_vector.plus(port[:3], delta[border.NORMAL])
+    return np.append(normal, port[RADIUS_OR_DISTANCE] + delta[border.DISTANCE])
 
 
 def _moved_camera(cam_from_rig: Array, delta: Array) -> Array:

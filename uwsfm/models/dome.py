@@ -1,0 +1,130 @@
+"""Kernels of the dome port: water rays from air rays, air rays from points, Jacobians.
+
+A port is one row, see `uwsfm.models.port`. All points and rays are in the camera frame,
+in metres. Failure is a status and NaN. The sphere is taken as whole: where a real dome
+ends, its mount is in the image.
+"""
+
+import math
+
+from uwsfm._jit import kernel
+from uwsfm.geometry.dome import dome_port_gradient, solve_dome_port
+from uwsfm.geometry.refraction import refract
+from uwsfm.models.status import (
+    IN_AIR_GAP,
+    IN_GLASS,
+    MISSES_PORT,
+    TOTAL_REFLECTION,
+    VALID,
+)
+
+
+@kernel
+def _range_inside(px, py, pz, dx, dy, dz, radius2):
+    """Range from a point inside a sphere around the origin to its surface."""
+    along = px * dx + py * dy + pz * dz
+    gap = radius2 - (px * px + py * py + pz * pz)
+    # Of the two forms of the positive root, the one that does not cancel.
+    root = math.sqrt(along * along + gap)
+    return gap / (root + along) if along > 0.0 else root - along
+
+
+@kernel
+def dome_water_ray(dx, dy, dz, port):
+    """Refract a finite unit direction in air through the dome.
+
+    Returns:
+        (status, origin on the outer surface (3), unit direction in water (3)).
+    """
+    nan = math.nan
+    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
+    outer = radius + port[4]
+    if not cx * cx + cy * cy + cz * cz < radius * radius:
+        return MISSES_PORT, nan, nan, nan, nan, nan, nan
+    # From here on, positions are relative to the dome's centre.
+    s = _range_inside(-cx, -cy, -cz, dx, dy, dz, radius * radius)
+    px, py, pz = s * dx - cx, s * dy - cy, s * dz - cz
+    inv = 1.0 / radius
+    gx, gy, gz = refract(dx, dy, dz, px * inv, py * inv, pz * inv, port[5] / port[6])
+    s = _range_inside(px, py, pz, gx, gy, gz, outer * outer)
+    px, py, pz = px + s * gx, py + s * gy, pz + s * gz
+    inv = 1.0 / outer
+    wx, wy, wz = refract(gx, gy, gz, px * inv, py * inv, pz * inv, port[6] / port[7])
+    if not abs(wx) < math.inf:
+        return TOTAL_REFLECTION, nan, nan, nan, nan, nan, nan
+    return VALID, px + cx, py + cy, pz + cz, wx, wy, wz
+
+
+@kernel
+def _invariants(x, y, z, port):
+    """<X, X>, <X, c>, <c, c> and |c x X|^2."""
+    cx, cy, cz = port[0], port[1], port[2]
+    sx, sy, sz = cy * z - cz * y, cz * x - cx * z, cx * y - cy * x
+    return (
+        x * x + y * y + z * z,
+        x * cx + y * cy + z * cz,
+        cx * cx + cy * cy + cz * cz,
+        sx * sx + sy * sy + sz * sz,
+    )
+
+
+@kernel
+def dome_air_ray(x, y, z, port):
+    """Ray in air v = X - kappa c of a finite point: (status, kappa, v (3)), not unit."""
+    nan = math.nan
+    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
+    outer = radius + port[4]
+    a, b, c, q = _invariants(x, y, z, port)
+    rho2 = a - 2.0 * b + c
+    if not rho2 > outer * outer:
+        status = IN_AIR_GAP if rho2 < radius * radius else IN_GLASS
+        return status, nan, nan, nan, nan
+    if not c < radius * radius:
+        return MISSES_PORT, nan, nan, nan, nan
+    kappa = solve_dome_port(
+        a, b, c, q, radius, port[4], port[5] / port[6], port[5] / port[7]
+    )
+    if not abs(kappa) < math.inf:
+        return TOTAL_REFLECTION, nan, nan, nan, nan
+    return VALID, kappa, x - kappa * cx, y - kappa * cy, z - kappa * cz
+
+
+@kernel
+def dome_jac(x, y, z, kappa, port, lens_rows, jac):
+    """Jacobian of the pixel of a point, by the implicit function theorem.
+
+    With v = X - kappa c, kappa a function of a = <X, X>, b = <X, c>, c2 = <c, c> and of
+    the dome, and L = d(pixel) / dv (2x3):
+        d/dX = L - (L c) (2 kappa_a X + kappa_b c)^T
+        d/dc = -kappa L - (L c) (kappa_b X + 2 kappa_c c)^T
+        d/dR = -(L c) kappa_R, and so on
+
+    Args:
+        x, y, z: the point.
+        kappa: as found by `dome_air_ray`.
+        port: row.
+        lens_rows: the six numbers of L, row by row.
+        jac: (2, JAC_SIZE), written.
+    """
+    cx, cy, cz, radius, thick = port[0], port[1], port[2], port[3], port[4]
+    n_air, n_glass, n_water = port[5], port[6], port[7]
+    mu_g, mu_w = n_air / n_glass, n_air / n_water
+    a, b, c, q = _invariants(x, y, z, port)
+    k_a, k_b, k_c, k_radius, k_thick, k_glass, k_water = dome_port_gradient(
+        kappa, a, b, c, q, radius, thick, mu_g, mu_w
+    )
+    for i in range(2):
+        lx, ly, lz = lens_rows[3 * i], lens_rows[3 * i + 1], lens_rows[3 * i + 2]
+        l_c = lx * cx + ly * cy + lz * cz
+        by_x, by_c = 2.0 * k_a * l_c, k_b * l_c
+        jac[i, 0] = lx - by_x * x - by_c * cx
+        jac[i, 1] = ly - by_x * y - by_c * cy
+        jac[i, 2] = lz - by_x * z - by_c * cz
+        by_c2 = 2.0 * k_c * l_c
+        jac[i, 3] = -kappa * lx - by_c * x - by_c2 * cx
+        jac[i, 4] = -kappa * ly - by_c * y - by_c2 * cy
+        jac[i, 5] = -kappa * lz - by_c * z - by_c2 * cz
+        jac[i, 6] = -l_c * k_thick
+        jac[i, 7] = l_c * k_glass * mu_g / n_glass
+        jac[i, 8] = l_c * k_water * mu_w / n_water
+        jac[i, 9] = -l_c * k_radius
