@@ -82,8 +82,8 @@ def dense_system(scene, layout):
                 -j_cam @ skew(turned),
                 length * j_cam @ unit_vector.tangent_basis(direction),
                 j_cam @ direction,
-                # normal (2), distance, n_water, thickness, n_glass
-                j_port[0][:, [3, 4, 5, 8, 6, 7]],
+                # normal (2), distance, n_water, thickness, n_glass, radius
+                j_port[0][:, [3, 4, 5, 8, 6, 7, 9]],
                 lens_columns(scene.cameras[c], rigid3.transform(cam, in_rig))
                 if layout.free_lens
                 else np.zeros((2, NUM_PARAMS)),

@@ -149,9 +149,30 @@ def test_water_index_is_refined_as_one_for_all_ports():
     for port in result.scene.ports:
         assert port.n_water == pytest.approx(1.333, abs=1e-9)
     assert errors_of(result.scene, truth)[0] < 1e-8
-    mixed = replace(truth, cameras=(truth.cameras[0], cameras[1]))
-    with pytest.raises(InputError, match="one index for all ports"):
-        calibrate(mixed, refine_water_index=True)
+
+
+def test_waters_that_differ_are_refined_one_by_one():
+    """A window into a tank beside one into the sea."""
+    truth = small_scene(8, 150).truth
+    seas = (1.333, 1.342)
+    cameras = [
+        c.with_port(replace(c.port, n_water=n))
+        for c, n in zip(truth.cameras, seas, strict=True)
+    ]
+    truth = replace(truth, cameras=tuple(cameras))
+    truth = replace(truth, xy=truth.projections()[0])
+    for water in ((1.336, 1.337), (1.337, 1.337)):
+        cameras = [
+            c.with_port(replace(c.port, n_water=n))
+            for c, n in zip(truth.cameras, water, strict=True)
+        ]
+        result = calibrate(
+            perturbed(replace(truth, cameras=tuple(cameras))),
+            refine_water_index=True,
+            separate_water_index=water[0] == water[1],
+        )
+        found = [port.n_water for port in result.scene.ports]
+        np.testing.assert_allclose(found, seas, atol=1e-8)
 
 
 def test_outliers_are_found_and_the_result_is_close_to_the_clean_one():

@@ -138,8 +138,10 @@ def test_names_are_printed_as_they_are(capsys):
     """Square brackets are markup to the library that draws the tables."""
     camera = {
         "name": "[/x]",
+        "port": "flat",
         "normal": [0.0, 0.0, 1.0],
         "normal_stddev_deg": None,
+        "normal_verdict": "held",
         "distance_m": 0.02,
         "distance_stddev_m": None,
         "distance_verdict": "held",

@@ -60,7 +60,7 @@ def test_round_trip_over_random_domes(rng):
 
 @DOMES
 def test_light_takes_the_path_of_least_time(rng, port):
-    """Fermat: the optical path over both crossings has no slope where we say it goes."""
+    """Fermat: the shortest optical path over both crossings is ours."""
     if port.thickness == 0.0:
         port = replace(port, thickness=1e-3)  # the oracle needs three layers
     camera = RefractiveCamera(PINHOLE, port)

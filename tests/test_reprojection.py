@@ -78,7 +78,7 @@ def test_jacobian_of_the_rig_pose_the_camera_pose_and_the_housing(camera, port, 
 
 
 def _with_port(entry):
-    return lambda x, delta: (*x[:2], x[2] + delta * np.eye(8)[entry], x[3])
+    return lambda x, delta: (*x[:2], x[2] + delta * np.eye(9)[entry], x[3])
 
 
 def _with_lens(model, slot):

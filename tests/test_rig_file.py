@@ -214,7 +214,7 @@ MISTAKES = [
     (PORT + "normal", [0, 0, 2], "port.normal: must have length 1, has length 2"),
     (PORT + "normal", [0, 1], "port.normal: needs 3 values, got 2"),
     (PORT + "glass_index", 0.67, "0.67 is not a refractive index"),
-    (PORT + "type", "dome", "port.type: must be 'flat', not 'dome'"),
+    (PORT + "type", "cube", "port.type: must be 'flat', 'dome' or 'none', not 'cube'"),
     (PORT + "refine", ["tilt"], "refine[0]: must be 'normal' or 'distance', not 'ti"),
     ("baseline_stddev_m", -0.1, "baseline_stddev_m: must be at least 0, not -0.1"),
     ("baseline_stddev_m", 0.3, "0.3 m should lie between 0 and the baseline, 0.2 m"),
@@ -230,7 +230,7 @@ MISTAKES = [
     (OPENCV + "fisheye", True, "a fisheye calibration has 4 values, got 5"),
     (OPENCV + "pixel_origin", DELETE, "opencv.pixel_origin: this key is missing"),
     # cameras and folders
-    ("cameras/1", DELETE, "got 1: the baseline between them is the only source of"),
+    ("cameras", [], "cameras: at least one is needed, got none"),
     ("cameras/1/name", "left", "cameras[1].name: 'left' is also the name of cameras["),
     ("cameras/1/images", "left/", "cameras[1].images: 'left' and the folder of"),
     ("cameras/1/images", "left/a", "hold the same images"),

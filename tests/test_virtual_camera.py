@@ -127,9 +127,7 @@ def test_jacobian_of_the_point_the_camera_pose_and_the_housing(
         assert status == Status.VALID
         return np.array(e)
 
-    status, e, j_rig, j_border = with_jac(
-        point, air_dir, cam_from_rig, port.row, sheet
-    )
+    status, e, j_rig, j_border = with_jac(point, air_dir, cam_from_rig, port.row, sheet)
     assert status == Status.VALID
     # The same digits; only the order of the compiled sums may differ.
     np.testing.assert_allclose(e, error(start), rtol=0, atol=1e-15)

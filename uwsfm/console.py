@@ -70,18 +70,38 @@ def housing_table(summary: dict[str, Any]) -> Table:
     """The refined housings, each number with its standard deviation."""
     table = Table(title="Housing: ± is one standard deviation", title_justify="left")
     table.add_column("camera", no_wrap=True)
-    for column in ("tilt x, y (deg)", "±", "distance (mm)", "±", "by the images"):
+    table.add_column("port", no_wrap=True)
+    for column in ("estimate", "±", "by the images"):
         table.add_column(column, justify="right", no_wrap=True)
     for camera in summary["cameras"]:
-        table.add_row(
-            Text(camera["name"]),
+        for row in _port_rows(camera):
+            table.add_row(Text(camera["name"]), *row)
+    return table
+
+
+def _port_rows(camera: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    """What, estimate, standard deviation and verdict of what a port has."""
+    if camera["port"] == "none":
+        return [("none", "", "", "")]
+    if camera["port"] == "dome":
+        center = ", ".join(f"{1e3 * value:+.2f}" for value in camera["center_m"])
+        spread = [_number(v, "{:.2f}", 1e3) for v in camera["center_stddev_m"]]
+        known = "-" if set(spread) == {"-"} else ", ".join(spread)
+        return [("dome centre (mm)", center, known, camera["center_verdict"])]
+    return [
+        (
+            "tilt x, y (deg)",
             _tilt(camera["normal"]),
             _number(camera["normal_stddev_deg"], "{:.3f}"),
+            camera["normal_verdict"],
+        ),
+        (
+            "distance (mm)",
             f"{1e3 * camera['distance_m']:.2f}",
             _number(camera["distance_stddev_m"], "{:.2f}", 1e3),
             camera["distance_verdict"],
-        )
-    return table
+        ),
+    ]
 
 
 def result_table(summary: dict[str, Any]) -> Table:
@@ -124,6 +144,13 @@ def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
         table.add_row(Text(entry["name"]), f"{entry['value']:.7g} ± {stddev}")
 
 
+_SHIFTS: dict[str, tuple[str, ...]] = {
+    "flat": ("tilt (deg)", "distance (mm)"),
+    "dome": ("centre x, y, z (mm)",),
+    "none": (),
+}
+
+
 def budget_table(summary: dict[str, Any]) -> Table:
     """What errors of the given numbers would do to the housing."""
     table = Table(
@@ -133,14 +160,19 @@ def budget_table(summary: dict[str, Any]) -> Table:
     table.add_column("given", no_wrap=True)
     for camera in summary["cameras"]:
         name = camera["name"]
-        table.add_column(f"{name}\ntilt (deg)", justify="right")
-        table.add_column(f"{name}\ndistance (mm)", justify="right")
+        for what in _SHIFTS[camera["port"]]:
+            table.add_column(f"{name}\n{what}", justify="right")
     for row in summary["error_budget"]:
         cells = []
-        for shift in row["cameras"]:
-            cells.append(_number(shift["tilt_deg"], "{:.3f}"))
-            sign = "" if row is summary["error_budget"][-1] else "+"
-            cells.append(_number(shift["distance_m"], "{:" + sign + ".2f}", 1e3))
+        sign = "" if row is summary["error_budget"][-1] else "+"
+        number = "{:" + sign + ".2f}"
+        for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
+            if camera["port"] == "flat":
+                cells.append(_number(shift["tilt_deg"], "{:.3f}"))
+                cells.append(_number(shift["distance_m"], number, 1e3))
+            elif camera["port"] == "dome":
+                moved = [_number(value, number, 1e3) for value in shift["center_m"]]
+                cells.append(", ".join(moved))
         table.add_row(row["if"], *cells)
     return table
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -13,18 +11,15 @@ from numpy.typing import ArrayLike
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY, Array
+from uwsfm.rig_values import UNIT_TOLERANCE
 
 if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
     import pycolmap
 
-    from uwsfm.models.port import FlatPort
+    from uwsfm.models.port import Port
     from uwsfm.models.radial_undistortion import LensConversion
     from uwsfm.models.refractive import RefractiveCamera
 
-UNIT_TOLERANCE = 1e-9
-"""Quaternions and normals nearer to unit length than this are taken as they are."""
-# Hand-copied unit vectors and rotations have few decimals; more than this is a mistake.
-_COPY_TOLERANCE = 1e-3
 # A rectilinear lens this short would see 157 degrees: a length in millimetres.
 _MIN_FOCAL_PER_SIDE = 0.1
 
@@ -38,10 +33,13 @@ class RigCamera:
     """Sub-folder of the image directory, with forward slashes."""
     camera: pycolmap.Camera
     """Intrinsics in air, with width and height; pixel origin as COLMAP."""
-    port: FlatPort
+    port: Port
     """In the camera frame; the initial value of whatever is refined."""
-    refine_normal: bool
-    refine_distance: bool
+    refine_normal: bool = False
+    """Of a flat port; so the next."""
+    refine_distance: bool = False
+    refine_center: bool = False
+    """Of a dome."""
     valid_radius_px: float | None = None
     """How far from the principal point the calibration in air reached; features beyond
     it do not take part. None: the whole image."""
@@ -56,16 +54,17 @@ class Rig:
     """Cameras fixed to each other; the first one is the reference.
 
     Raises:
-        InputError: fewer than two cameras, a name or folder used twice, ports that
-            disagree on the water, or poses and baseline that contradict each other.
+        InputError: no camera, a name or folder used twice, or poses and baseline that
+            contradict each other.
     """
 
     cameras: tuple[RigCamera, ...]
     cam_from_rig: Array | None
     """(C, 7) poses, row 0 the identity; None if only the baseline length is known."""
-    baseline_m: float
-    """Length of the second camera's translation: the only source of scale."""
-    baseline_stddev_m: float
+    baseline_m: float | None
+    """Length of the second camera's translation, which gives the scale; None: there is
+    one camera only."""
+    baseline_stddev_m: float = 0.0
     """Standard deviation of the baseline; 0 holds it exactly."""
     refine_cam_from_rig: bool = True
     """Whether the images may turn the cameras against each other; False trusts the
@@ -73,14 +72,10 @@ class Rig:
 
     def __post_init__(self) -> None:
         self._check_cameras()
-        if not 0.0 < self.baseline_m < np.inf:
-            raise InputError(f"baseline_m: {self.baseline_m:g} m gives no scale")
-        if not 0.0 <= self.baseline_stddev_m <= self.baseline_m:
-            raise InputError(
-                f"baseline_stddev_m: {self.baseline_stddev_m:g} m should lie between 0 "
-                f"and the baseline, {self.baseline_m:g} m"
-            )
-        if self.cam_from_rig is not None:
+        self._check_baseline()
+        if len(self.cameras) == 1:
+            object.__setattr__(self, "cam_from_rig", IDENTITY[None])
+        elif self.cam_from_rig is not None:
             object.__setattr__(self, "cam_from_rig", self._checked_poses())
         elif len(self.cameras) != 2:
             raise InputError(
@@ -93,12 +88,26 @@ class Rig:
                 "cam_from_rig to hold it"
             )
 
-    def _check_cameras(self) -> None:
-        if len(self.cameras) < 2:
+    def _check_baseline(self) -> None:
+        baseline, stddev = self.baseline_m, self.baseline_stddev_m
+        if len(self.cameras) == 1:
+            if baseline is not None or stddev != 0.0:
+                raise InputError(
+                    "baseline_m and baseline_stddev_m are of rigs of two cameras or "
+                    "more, this one has a single camera"
+                )
+            return
+        if baseline is None or not 0.0 < baseline < np.inf:
+            raise InputError(f"baseline_m: {baseline} m gives no scale")
+        if not 0.0 <= stddev <= baseline:
             raise InputError(
-                f"cameras: at least two are needed, got {len(self.cameras)}: "
-                "the baseline between them is the only source of scale"
+                f"baseline_stddev_m: {stddev:g} m should lie between 0 "
+                f"and the baseline, {baseline:g} m"
             )
+
+    def _check_cameras(self) -> None:
+        if not self.cameras:
+            raise InputError("cameras: at least one is needed, got none")
         for j, camera in enumerate(self.cameras):
             for i, other in enumerate(self.cameras[:j]):
                 if camera.name == other.name:
@@ -113,11 +122,6 @@ class Rig:
                         f"cameras[{j}].images: {camera.images!r} and the folder of "
                         f"cameras[{i}], {other.images!r}, hold the same images"
                     )
-            if camera.port.n_water != self.cameras[0].port.n_water:
-                raise InputError(
-                    f"cameras[{j}].port: its water index, {camera.port.n_water:g}, is "
-                    f"not that of cameras[0], {self.cameras[0].port.n_water:g}"
-                )
 
     def _checked_poses(self) -> Array:
         """A read-only copy of `cam_from_rig` (C, 7)."""
@@ -138,10 +142,11 @@ class Rig:
         if not np.all(np.any(poses[1:, 4:], axis=1)):
             raise InputError("cam_from_rig: a translation of length zero")
         baseline = float(np.linalg.norm(poses[1, 4:]))
+        given = self.baseline_m or 0.0
         # A guard against a silent change of scale, not against rounding.
-        if abs(baseline - self.baseline_m) > UNIT_TOLERANCE * self.baseline_m:
+        if abs(baseline - given) > UNIT_TOLERANCE * given:
             raise InputError(
-                f"rig baseline_m is {self.baseline_m}, but the second camera's "
+                f"rig baseline_m is {given}, but the second camera's "
                 f"cam_from_rig has a translation of {baseline} m"
             )
         poses.setflags(write=False)
@@ -153,15 +158,16 @@ class Rig:
 
         return tuple(RefractiveCamera(c.camera, c.port) for c in self.cameras)
 
-    def with_geometry(self, cam_from_rig: ArrayLike, ports: Sequence[FlatPort]) -> Rig:
+    def with_geometry(self, cam_from_rig: ArrayLike, ports: Sequence[Port]) -> Rig:
         """This rig with new poses (C, 7) and ports (C); the baseline follows."""
         poses = np.asarray(cam_from_rig, dtype=np.float64)
         pairs = zip(self.cameras, ports, strict=True)
+        lengths = [float(np.linalg.norm(pose[4:])) for pose in poses]
         return replace(
             self,
             cameras=tuple(replace(camera, port=port) for camera, port in pairs),
             cam_from_rig=poses,
-            baseline_m=float(np.linalg.norm(poses[1, 4:])),
+            baseline_m=lengths[1] if len(lengths) > 1 else None,
         )
 
 
@@ -299,100 +305,3 @@ def _pinhole_params(camera_matrix: ArrayLike, pixel_origin: str) -> list[float]:
         raise InputError("camera_matrix is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     shift = 0.5 if pixel_origin == "opencv" else 0.0  # OpenCV -> COLMAP pixel origin
     return [fx, fy, cx + shift, cy + shift]
-
-
-# ---- What the numbers of a rig may be: each returns its value or raises InputError ---
-
-
-def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float:
-    """Refuses negative lengths, and millimetres taken for metres."""
-    if value < 0:
-        raise InputError(f"{value:g} m is negative; a {noun} cannot be")
-    if value > limit:
-        guess = np.format_float_positional(float(f"{value / 1000:.6g}"), min_digits=3)
-        raise InputError(
-            f"{value:g} m is not a {noun}; {plural} are in metres, "
-            f"did you mean {guess}?"
-        )
-    return value
-
-
-def checked_port_distance(value: float) -> float:
-    """From the camera to the glass, metres."""
-    return _checked_metres(value, "port distance", "distances", 0.5)
-
-
-def checked_thickness(value: float) -> float:
-    """Of the glass, metres."""
-    return _checked_metres(value, "glass thickness", "thicknesses", 0.5)
-
-
-def checked_baseline(value: float) -> float:
-    """Between two cameras, metres."""
-    if value == 0:
-        raise InputError("a baseline of length zero gives no scale")
-    return _checked_metres(value, "baseline", "baselines", 10.0)
-
-
-def checked_index(value: float) -> float:
-    """A refractive index of water, glass or plastic."""
-    if not 1 <= value <= 2.5:
-        raise InputError(
-            f"{value:g} is not a refractive index; expected 1 to 2.5 "
-            "(water about 1.33, acrylic 1.49, glass 1.46 to 1.52)"
-        )
-    return value
-
-
-def checked_unit(values: tuple[float, ...]) -> tuple[float, ...]:
-    """A vector or quaternion of unit length, made exact if it was rounded."""
-    length = math.hypot(*values)
-    if abs(length - 1) > _COPY_TOLERANCE:
-        raise InputError(f"must have length 1, has length {length:.4g}")
-    if abs(length - 1) <= UNIT_TOLERANCE:
-        return values
-    return tuple(value / length for value in values)
-
-
-def checked_normal(values: tuple[float, ...]) -> tuple[float, ...]:
-    """A port normal (3,), which goes from the camera to the water."""
-    if values[2] <= 0:
-        raise InputError(
-            "points back at the camera (its z must be positive): the normal goes from "
-            "the camera to the water, is its sign flipped?"
-        )
-    return checked_unit(values)
-
-
-def checked_rotation(
-    rows: tuple[tuple[float, ...], ...],
-) -> tuple[tuple[float, ...], ...]:
-    """A rotation matrix (3, 3), as its rows."""
-    matrix = np.array(rows)
-    off = np.max(np.abs(matrix @ matrix.T - np.eye(3)))
-    if not off <= _COPY_TOLERANCE:
-        raise InputError(
-            "is not a rotation: rows must have length 1 and be perpendicular, they are "
-            f"off by {off:.2g}"
-        )
-    if np.linalg.det(matrix) < 0:
-        raise InputError("is a reflection (determinant -1), not a rotation")
-    return rows
-
-
-def checked_text(value: str) -> str:
-    """A name: one line, not blank."""
-    if not value.strip() or not value.isprintable():
-        raise InputError(f"must be one line of text, not {value!r}")
-    return value
-
-
-def checked_folder(value: str) -> str:
-    """A folder inside the image directory, with forward slashes and no dots."""
-    path = PurePosixPath(checked_text(value))
-    if "\\" in value:
-        raise InputError(f"write {value!r} with forward slashes")
-    absolute = path.is_absolute() or PureWindowsPath(value).drive
-    if absolute or ".." in path.parts or not path.parts:
-        raise InputError(f"{value!r} must be a folder inside the image directory")
-    return str(path)

@@ -13,28 +13,19 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import (
-    ValidationError,
-)
+from pydantic import ValidationError
 
 from uwsfm._files import replaced_file
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
-from uwsfm.models.port import FlatPort
-from uwsfm.rig import (
-    Rig,
-    RigCamera,
-    checked_baseline,
-)
+from uwsfm.models.port import DomePort, NoPort
+from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_schema import ENTRIES, CameraEntry, RadialUndistortionLens, RigFile
-
-if TYPE_CHECKING:
-    pass
-
+from uwsfm.rig_values import checked_baseline
 
 # ---- Reading ------------------------------------------------------------------------
 
@@ -99,7 +90,8 @@ def _read_yaml(path: Path) -> dict:
 
 
 def _to_rig(file: RigFile) -> Rig:
-    poses, baseline = [IDENTITY], 0.0
+    poses: list[Any] = [IDENTITY]
+    baseline = None
     for i, entry in enumerate(file.cameras):
         problem = _placement_problem(entry, i, len(file.cameras))
         if problem:
@@ -120,7 +112,6 @@ def _to_rig(file: RigFile) -> Rig:
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
     port, lens = entry.port, entry.intrinsics
-    x, y, z = port.normal
     conversion = None
     if isinstance(lens, RadialUndistortionLens):
         camera, conversion = lens.converted()
@@ -130,11 +121,10 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         name=entry.name,
         images=entry.images,
         camera=camera,
-        port=FlatPort(
-            (x, y, z), port.distance_m, port.thickness_m, port.glass_index, n_water
-        ),
+        port=port.to_port(n_water),
         refine_normal="normal" in port.refine,
         refine_distance="distance" in port.refine,
+        refine_center="center" in port.refine,
         valid_radius_px=lens.valid_radius_px,
         conversion_max_px=conversion.max_px if conversion else None,
         conversion_rms_px=conversion.rms_px if conversion else None,
@@ -268,12 +258,13 @@ def dump_rig(
         raise InputError(
             f"comments on cameras that are not in the rig: {sorted(unknown)}"
         )
-    top = {
+    top: dict[str, Any] = {
         "version": 1,
-        "water": {"refractive_index": rig.cameras[0].port.n_water},
-        "baseline_stddev_m": float(rig.baseline_stddev_m),
-        "refine_cam_from_rig": rig.refine_cam_from_rig,
+        "water": {"refractive_index": _common_water(rig)},
     }
+    if len(rig.cameras) > 1:
+        top["baseline_stddev_m"] = float(rig.baseline_stddev_m)
+        top["refine_cam_from_rig"] = rig.refine_cam_from_rig
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):
         lines = [*comments.get(camera.name, ()), *_conversion_lines(camera)]
@@ -295,10 +286,7 @@ def _conversion_lines(camera: RigCamera) -> list[str]:
 
 def _block(rig: Rig, i: int) -> dict[str, Any]:
     """The keys of camera ``i``, as `CameraEntry` reads them."""
-    camera, lens, port = rig.cameras[i], rig.cameras[i].camera, rig.cameras[i].port
-    if port.n_air != 1.0:
-        raise InputError(f"{camera.name}: rig.yaml has no key for an air index != 1")
-    refine = {"normal": camera.refine_normal, "distance": camera.refine_distance}
+    camera, lens = rig.cameras[i], rig.cameras[i].camera
     block: dict[str, Any] = {
         "name": camera.name,
         "images": camera.images,
@@ -308,23 +296,53 @@ def _block(rig: Rig, i: int) -> dict[str, Any]:
             "height_px": lens.height,
             "params": lens.params.tolist(),
         },
-        "port": {
-            "type": "flat",
-            "normal": list(port.normal),
-            "distance_m": port.distance,
-            "thickness_m": port.thickness,
-            "glass_index": port.n_glass,
-            "refine": [name for name, chosen in refine.items() if chosen],
-        },
+        "port": _port_block(camera, _common_water(rig)),
     }
     if camera.valid_radius_px is not None:
         block["intrinsics"]["valid_radius_px"] = camera.valid_radius_px
     if i > 0 and rig.cam_from_rig is None:
-        block["baseline_m"] = float(rig.baseline_m)
+        block["baseline_m"] = rig.baseline_m
     elif i > 0 and rig.cam_from_rig is not None:
         pose = rig.cam_from_rig[i].tolist()
         block["cam_from_rig"] = {"rotation_xyzw": pose[:4], "translation_m": pose[4:]}
     return block
+
+
+def _common_water(rig: Rig) -> float:
+    """The water index of the first port; of a rig without one, any."""
+    indices = [c.port.n_water for c in rig.cameras if not isinstance(c.port, NoPort)]
+    return indices[0] if indices else 1.0
+
+
+def _port_block(camera: RigCamera, n_water: float) -> dict[str, Any]:
+    """The keys of a port, as the entries of `uwsfm.rig_schema` read them."""
+    port = camera.port
+    if isinstance(port, NoPort):
+        return {"type": "none"}
+    if port.n_air != 1.0:
+        raise InputError(f"{camera.name}: rig.yaml has no key for an air index != 1")
+    if isinstance(port, DomePort):
+        refine = {"center": camera.refine_center}
+        place: dict[str, Any] = {
+            "type": "dome",
+            "center_m": list(port.center),
+            "radius_m": port.radius,
+        }
+    else:
+        refine = {"normal": camera.refine_normal, "distance": camera.refine_distance}
+        place = {
+            "type": "flat",
+            "normal": list(port.normal),
+            "distance_m": port.distance,
+        }
+    water = {} if port.n_water == n_water else {"water_index": port.n_water}
+    return {
+        **place,
+        "thickness_m": port.thickness,
+        "glass_index": port.n_glass,
+        **water,
+        "refine": [name for name, chosen in refine.items() if chosen],
+    }
 
 
 def _yaml(data: Any) -> str:

@@ -18,15 +18,20 @@ from pydantic import (
 )
 
 from uwsfm.geometry.rigid3 import Array, from_rotmat
+from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.rig import (
     camera_from_colmap,
     camera_from_opencv,
     camera_from_radial_undistortion,
+)
+from uwsfm.rig_values import (
     checked_baseline,
+    checked_center,
     checked_folder,
     checked_index,
     checked_normal,
     checked_port_distance,
+    checked_radius,
     checked_rotation,
     checked_text,
     checked_thickness,
@@ -59,13 +64,78 @@ class WaterEntry(Entry):
     refractive_index: _Index
 
 
-class PortEntry(Entry):
-    type: Literal["flat"]
+_Thickness = Annotated[_Number, AfterValidator(checked_thickness)]
+_PORT_KINDS = ("flat", "dome", "none")
+_Kind = Literal["flat", "dome", "none"]
+
+
+class FlatPortEntry(Entry):
+    type: _Kind
     normal: Annotated[_Vector, AfterValidator(checked_normal)]
     distance_m: Annotated[_Number, AfterValidator(checked_port_distance)]
-    thickness_m: Annotated[_Number, AfterValidator(checked_thickness)]
+    thickness_m: _Thickness
     glass_index: _Index
+    water_index: _Index | None = None
     refine: Annotated[tuple[Literal["normal", "distance"], ...], Field(strict=False)]
+
+    def to_port(self, n_water: float) -> FlatPort:
+        x, y, z = self.normal
+        return FlatPort(
+            (x, y, z),
+            self.distance_m,
+            self.thickness_m,
+            self.glass_index,
+            self.water_index or n_water,
+        )
+
+
+class DomePortEntry(Entry):
+    type: _Kind
+    center_m: Annotated[_Vector, AfterValidator(checked_center)]
+    radius_m: Annotated[_Number, AfterValidator(checked_radius)]
+    thickness_m: _Thickness
+    glass_index: _Index
+    water_index: _Index | None = None
+    refine: Annotated[tuple[Literal["center"], ...], Field(strict=False)]
+
+    @model_validator(mode="after")
+    def _holds_the_camera(self) -> DomePortEntry:
+        self.to_port(1.333)
+        return self
+
+    def to_port(self, n_water: float) -> DomePort:
+        x, y, z = self.center_m
+        return DomePort(
+            (x, y, z),
+            self.radius_m,
+            self.thickness_m,
+            self.glass_index,
+            self.water_index or n_water,
+        )
+
+
+class NoPortEntry(Entry):
+    type: _Kind
+
+    @property
+    def refine(self) -> tuple[()]:
+        return ()
+
+    def to_port(self, n_water: float) -> NoPort:
+        return NoPort()
+
+
+def _port_tag(value: Any) -> str:
+    kind = value.get("type") if isinstance(value, dict) else None
+    return f"({kind})" if kind in _PORT_KINDS else "(flat)"
+
+
+PortEntry = Annotated[
+    Annotated[FlatPortEntry, Tag("(flat)")]
+    | Annotated[DomePortEntry, Tag("(dome)")]
+    | Annotated[NoPortEntry, Tag("(none)")],
+    Discriminator(_port_tag),
+]
 
 
 class ColmapLens(Entry):
@@ -193,6 +263,8 @@ ENTRIES: dict[str, type[Entry]] = {
     "opencv": OpenCvBlock,
     "(radial_undistortion)": RadialUndistortionLens,
     "radial_undistortion": RadialUndistortionBlock,
-    "port": PortEntry,
+    "(flat)": FlatPortEntry,
+    "(dome)": DomePortEntry,
+    "(none)": NoPortEntry,
     "cam_from_rig": CamFromRig,
 }

@@ -15,6 +15,7 @@ from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD
@@ -23,6 +24,8 @@ from uwsfm.solver.layout import HELD
 WEAK_SHARE = 0.25
 # Tilts better than this can be told from a straight port by eye.
 WEAK_TILT_DEG, OPEN_TILT_DEG = 0.2, 1.0
+# Of the centre of a dome, by its radius: a hundredth moves pixels by about one in 1000.
+WEAK_CENTER, OPEN_CENTER = 0.02, 0.2
 # Below this, relief and changes of range do not separate depth from port distance.
 FLAT, LEVEL = 0.03, 0.15
 FEW_FRAMES = 5
@@ -43,6 +46,14 @@ def normal_verdict(cov: CameraCovariance, refined: bool) -> str:
     if not refined:
         return "held"
     return _verdict(cov.normal_stddev_deg, WEAK_TILT_DEG, OPEN_TILT_DEG)
+
+
+def center_verdict(radius: float, cov: CameraCovariance, refined: bool) -> str:
+    """Whether the images determine the centre of a dome: a word for people."""
+    if not refined:
+        return "held"
+    stddev = float(np.linalg.norm(cov.center_stddev_m))
+    return _verdict(stddev, WEAK_CENTER * radius, OPEN_CENTER * radius)
 
 
 def _verdict(stddev: float, weak: float, lost: float) -> str:
@@ -125,6 +136,7 @@ def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]
         *at_zero,
         *_distances(result, names, geometry),
         *_tilts(result, names),
+        *_centers(result, names),
         *_inseparable(result, names),
     )
 
@@ -134,7 +146,8 @@ def _distances(
 ) -> list[str]:
     """The weak directions of the port distances, weakest first."""
     covariance = result.covariance
-    cols = covariance.border_cols[:, border.DISTANCE]
+    flat = [isinstance(port, FlatPort) for port in result.scene.ports]
+    cols = np.where(flat, covariance.border_cols[:, border.DISTANCE], HELD)
     free = np.nonzero(cols != HELD)[0]
     if not len(free):
         return []
@@ -143,7 +156,8 @@ def _distances(
     reported = np.array([covariance.cameras[c].distance_stddev_m for c in free])
     grow = reported / np.sqrt(np.diag(block))
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
-    typical = float(np.mean([result.scene.ports[c].distance for c in free]))
+    ports = [result.scene.ports[c] for c in free]
+    typical = float(np.mean([p.distance for p in ports if isinstance(p, FlatPort)]))
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         # Of one distance, not of the unit vector that several share.
@@ -181,12 +195,32 @@ def _direction(vector: Array, names: list[str]) -> str:
 def _tilts(result: CalibrationResult, names: Sequence[str]) -> list[str]:
     sentences = []
     for c, camera in enumerate(result.covariance.cameras):
+        if not isinstance(result.scene.ports[c], FlatPort):
+            continue
         refined = bool(result.covariance.border_cols[c, border.NORMAL][0] != HELD)
         word = normal_verdict(camera, refined)
         if word in ("weakly determined", "not determined"):
             sentences.append(
                 f"the tilt of the port of {names[c]} is {word}: standard deviation "
                 f"{camera.normal_stddev_deg:.2f} deg; more points or frames would help"
+            )
+    return sentences
+
+
+def _centers(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+    sentences = []
+    for c, camera in enumerate(result.covariance.cameras):
+        port = result.scene.ports[c]
+        if not isinstance(port, DomePort):
+            continue
+        refined = bool(result.covariance.border_cols[c, border.CENTER][0] != HELD)
+        word = center_verdict(port.radius, camera, refined)
+        if word in ("weakly determined", "not determined"):
+            x, y, z = (1e3 * value for value in camera.center_stddev_m)
+            sentences.append(
+                f"the centre of the dome of {names[c]} is {word}: standard deviation "
+                f"{x:.1f}, {y:.1f}, {z:.1f} mm; hold it if it was measured better, or "
+                "add nearer points and more frames"
             )
     return sentences
 
@@ -223,6 +257,10 @@ def _labels(
     labels: list[tuple[str, str]] = []
     for c, name in enumerate(names):
         for slot, text in kinds.items():
+            if slot == border.DISTANCE and not isinstance(
+                result.scene.ports[c], FlatPort
+            ):
+                continue
             column = int(result.covariance.border_cols[c, slot])
             if column != HELD and column not in columns:
                 columns.append(column)

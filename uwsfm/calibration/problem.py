@@ -169,7 +169,7 @@ class CalibrateOptions:
         """(C, BORDER_SIZE) columns of what is refined, HELD for the rest.
 
         Args:
-            cameras: C of them; their lenses and kinds of port have different parameters.
+            cameras: C of them; what can move depends on their lenses and ports.
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
         count, ports = len(at_zero), [camera.port for camera in cameras]

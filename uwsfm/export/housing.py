@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from uwsfm.calibration.observability import distance_verdict
-from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.rig import Rig
+from uwsfm.calibration.observability import center_verdict, distance_verdict
+from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
 
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
@@ -27,13 +28,30 @@ def export_housing(
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
     camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
-    distance = calibration.scene.ports[index].distance
+    port = calibration.scene.ports[index]
     lines = []
     if not calibration.covariance.determined:
         return ["the images do not determine this housing: no standard deviations"]
+    if isinstance(port, DomePort) and camera.refine_center:
+        x, y, z = (f"{1e3 * value:.3f}" for value in cov.center_stddev_m)
+        verdict = center_verdict(port.radius, cov, True)
+        lines.append(
+            f"center: standard deviation {x}, {y}, {z} mm, {verdict} by the images"
+        )
+    if isinstance(port, FlatPort):
+        lines += _flat_comments(camera, port, cov)
+    if index > 0 and calibration.options.refine_cam_from_rig:
+        lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
+    return lines
+
+
+def _flat_comments(
+    camera: RigCamera, port: FlatPort, cov: CameraCovariance
+) -> list[str]:
+    lines = []
     if camera.refine_normal:
         lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
-    verdict = distance_verdict(distance, cov, camera.refine_distance)
+    verdict = distance_verdict(port.distance, cov, camera.refine_distance)
     if cov.distance_at_zero:
         lines.append(f"distance: {verdict}; the images contradict the lens in air")
     elif camera.refine_distance:
@@ -41,6 +59,4 @@ def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} mm, "
             f"{verdict} by the images"
         )
-    if index > 0 and calibration.options.refine_cam_from_rig:
-        lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
     return lines

@@ -12,11 +12,16 @@ import numpy as np
 
 from uwsfm._files import replaced_file
 from uwsfm.calibration.error_budget import BudgetRow
-from uwsfm.calibration.observability import distance_verdict, normal_verdict
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.observability import (
+    center_verdict,
+    distance_verdict,
+    normal_verdict,
+)
+from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.models.lens import param_slots
+from uwsfm.models.port import DomePort, NoPort, Port
 from uwsfm.residuals import border
-from uwsfm.rig import Rig
+from uwsfm.rig import Rig, RigCamera
 from uwsfm.solver.layout import HELD
 
 PACKAGES = (
@@ -39,28 +44,13 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
     for index, camera in enumerate(rig.cameras):
         cov = calibration.covariance.cameras[index]
         pose = calibration.scene.cam_from_rig[index]
-        port = calibration.scene.ports[index]
         turned = index > 0 and calibration.options.refine_cam_from_rig
         entries.append(
             {
                 "name": camera.name,
                 "lens_conversion_max_px": camera.conversion_max_px,
                 "lens_conversion_rms_px": camera.conversion_rms_px,
-                "normal": list(port.normal),
-                "normal_stddev_deg": _stddev(
-                    cov.normal_stddev_deg, camera.refine_normal
-                ),
-                "normal_verdict": normal_verdict(cov, camera.refine_normal),
-                "distance_m": port.distance,
-                "distance_stddev_m": _stddev(
-                    cov.distance_stddev_m,
-                    camera.refine_distance and not cov.distance_at_zero,
-                ),
-                "distance_verdict": distance_verdict(
-                    port.distance, cov, camera.refine_distance
-                ),
-                "thickness_m": port.thickness,
-                "glass_index": port.n_glass,
+                **_port_summary(camera, calibration.scene.ports[index], cov),
                 "cam_from_rig": {
                     "rotation_xyzw": pose[:4].tolist(),
                     "translation_m": pose[4:].tolist(),
@@ -72,6 +62,45 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
             }
         )
     return entries
+
+
+def _port_summary(
+    camera: RigCamera, port: Port, cov: CameraCovariance
+) -> dict[str, Any]:
+    """What is known of a port; what is measured has the names of the rig file."""
+    if isinstance(port, NoPort):
+        return {"port": "none"}
+    if isinstance(port, DomePort):
+        place: dict[str, Any] = {
+            "port": "dome",
+            "center_m": list(port.center),
+            "center_stddev_m": [
+                _stddev(value, camera.refine_center) for value in cov.center_stddev_m
+            ],
+            "center_verdict": center_verdict(port.radius, cov, camera.refine_center),
+            "radius_m": port.radius,
+        }
+    else:
+        at_zero = cov.distance_at_zero
+        place = {
+            "port": "flat",
+            "normal": list(port.normal),
+            "normal_stddev_deg": _stddev(cov.normal_stddev_deg, camera.refine_normal),
+            "normal_verdict": normal_verdict(cov, camera.refine_normal),
+            "distance_m": port.distance,
+            "distance_stddev_m": _stddev(
+                cov.distance_stddev_m, camera.refine_distance and not at_zero
+            ),
+            "distance_verdict": distance_verdict(
+                port.distance, cov, camera.refine_distance
+            ),
+        }
+    return {
+        **place,
+        "thickness_m": port.thickness,
+        "glass_index": port.n_glass,
+        "water_index": port.n_water,
+    }
 
 
 def _stddev(value: float, refined: bool) -> float | None:
@@ -109,7 +138,11 @@ def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, 
             stddev = _stddev(float(stddevs[column]), True)
             entries.append({"name": name, "value": value, "stddev": stddev})
 
-    add("water index", 0, border.WATER_INDEX, scene.ports[0].n_water)
+    waters = calibration.covariance.border_cols[:, border.WATER_INDEX]
+    for c in [c for c in range(len(waters)) if waters[c] not in waters[:c]]:
+        name = "water index" if len({*waters} - {HELD}) == 1 else "water index at {}"
+        text = name.format(rig.cameras[c].name)
+        add(text, c, border.WATER_INDEX, scene.ports[c].n_water)
     for c, item in enumerate(rig.cameras):
         length = float(np.linalg.norm(scene.cam_from_rig[c, 4:]))
         add(f"baseline of {item.name} (m)", c, border.LENGTH, length)
@@ -131,6 +164,7 @@ def budget_summary(rows: Sequence[BudgetRow]) -> list[dict[str, Any]]:
                 {
                     "tilt_deg": _stddev(shift.tilt_deg, True),
                     "distance_m": _stddev(shift.distance_m, True),
+                    "center_m": [_stddev(value, True) for value in shift.center_m],
                 }
                 for shift in row.shifts
             ],

@@ -70,7 +70,7 @@ def _invariants(x, y, z, port):
 
 @kernel
 def dome_air_ray(x, y, z, port):
-    """Ray in air v = X - kappa c of a finite point: (status, kappa, v (3)), not unit."""
+    """Ray in air v = X - kappa c, not unit, of a point: (status, kappa, v (3))."""
     nan = math.nan
     cx, cy, cz, radius = port[0], port[1], port[2], port[3]
     outer = radius + port[4]

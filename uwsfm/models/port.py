@@ -37,7 +37,7 @@ def _vector(what: str, values: ArrayLike) -> Array:
     except (TypeError, ValueError):
         vector = np.empty(0)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InputError(f"{what} must be 3 finite numbers, got {values}")
+        raise InputError(f"{what} must be 3 finite numbers, got {values!r}")
     return vector
 
 

@@ -52,7 +52,7 @@ def unproject(px, py, lens, port):
 
 @kernel
 def air_ray(x, y, z, port):
-    """Ray in air of a point: (status, root of the port's equation, v (3)), v not unit."""
+    """Ray in air of a point: (status, root of the port's equation, v (3), not unit)."""
     if not abs(x) + abs(y) + abs(z) < math.inf:
         nan = math.nan
         return NOT_FINITE, nan, nan, nan, nan

@@ -182,9 +182,7 @@ class RefractiveCamera:
         xy = np.empty((len(points), 2))
         jac = np.empty((len(points), 2, projection.JAC_SIZE))
         status = np.empty(len(points), dtype=np.uint8)
-        projection.project_with_jac_batch(
-            points, self.lens, self._row, xy, jac, status
-        )
+        projection.project_with_jac_batch(points, self.lens, self._row, xy, jac, status)
         return xy, jac, status == VALID
 
     def _project(self, points_in_cam: ArrayLike) -> tuple[Array, StatusArray]:

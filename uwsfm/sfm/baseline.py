@@ -84,7 +84,7 @@ def rig_from_baseline(
         )
     average = robust_average(relative[:: -(-len(relative) // MAX_FRAMES)])
     adjusted = _adjust(models[0], database_path, frames, average)
-    return with_baseline(adjusted, pinholes, rig.baseline_m)
+    return with_baseline(adjusted, pinholes, rig.baseline_m or 0.0)
 
 
 def _relative_poses(model: pycolmap.Reconstruction, frames: Frames) -> Array:

@@ -42,6 +42,7 @@ def rig_options(rig: Rig) -> dict[str, Any]:
     return {
         "refine_normals": tuple(camera.refine_normal for camera in rig.cameras),
         "refine_distances": tuple(camera.refine_distance for camera in rig.cameras),
+        "refine_centers": tuple(camera.refine_center for camera in rig.cameras),
         "refine_cam_from_rig": rig.refine_cam_from_rig,
         "baseline_stddev_m": rig.baseline_stddev_m,
     }

@@ -248,7 +248,7 @@ def _rig_content(rig: Rig) -> list[Any]:
             item.camera.width,
             item.camera.height,
             np.asarray(item.camera.params).tolist(),
-            item.port.params.tolist(),
+            item.port.row.tolist(),
         ]
         for item in rig.cameras
     ]

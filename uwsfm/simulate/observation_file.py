@@ -7,7 +7,7 @@ import pycolmap
 
 from uwsfm._files import replaced_file
 from uwsfm.errors import InputError
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import port_from_row
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
 from uwsfm.simulate.observations import SimulatedScene
@@ -16,7 +16,8 @@ ARRAYS = {
     "camera_model": "(C,) COLMAP model names of the in-air lenses",
     "camera_size": "(C, 2) width and height, pixels",
     "camera_params": "(C, K) in-air intrinsics, padded with NaN",
-    "port_params": "(C, 8) true [Nx, Ny, Nz, distance, thickness, n_a, n_g, n_w]",
+    "port_rows": "(C, 9) true [Nx, Ny, Nz, distance, thickness, n_a, n_g, n_w, kind]; "
+    "kind 0; of a dome [Cx, Cy, Cz, radius, ...], kind 1; none: kind 2",
     "cam_from_rig": "(C, 7) true poses [qx, qy, qz, qw, tx, ty, tz]",
     "rig_from_world": "(F, 7) true poses",
     "points": "(P, 3) true points, metres",
@@ -43,7 +44,7 @@ def write_observations(simulated: SimulatedScene, path: Path) -> None:
             camera_model=np.array([lens.model_name for lens in lenses]),
             camera_size=np.array([[lens.width, lens.height] for lens in lenses]),
             camera_params=params,
-            port_params=np.stack([port.params for port in truth.ports]),
+            port_rows=np.stack([port.row for port in truth.ports]),
             cam_from_rig=truth.cam_from_rig,
             rig_from_world=truth.rig_from_world,
             points=truth.points,
@@ -77,7 +78,7 @@ def read_observations(path: Path) -> SimulatedScene:
                 height=int(size[1]),
                 params=params[np.isfinite(params)],
             ),
-            FlatPort.from_params(port),
+            port_from_row(port),
         )
         for model, size, params, port in zip(
             *(data[name] for name in list(ARRAYS)[:4]), strict=True

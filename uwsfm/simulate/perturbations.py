@@ -7,6 +7,7 @@ import numpy as np
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene
+from uwsfm.simulate.rigs import rough_port
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +18,7 @@ class Perturbation:
     """
 
     straight_ports: bool = True
-    """Every port normal becomes (0, 0, 1)."""
+    """Every port normal becomes (0, 0, 1), and domes concentric."""
     distance_scale: float = 0.5
     """Of every port distance."""
     rotation_stddev_deg: float = 0.0
@@ -39,10 +40,10 @@ def perturbed(scene: Scene, perturbation: Perturbation | None = None) -> Scene:
     rng = np.random.default_rng(how.seed)
     cameras = tuple(
         camera.with_port(
-            replace(
+            rough_port(
                 camera.port,
-                normal=(0.0, 0.0, 1.0) if how.straight_ports else camera.port.normal,
-                distance=how.distance_scale * camera.port.distance,
+                straight=how.straight_ports,
+                distance_scale=how.distance_scale,
             )
         )
         for camera in scene.cameras

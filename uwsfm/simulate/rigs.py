@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
+from uwsfm.models.port import DomePort, FlatPort, Port
 from uwsfm.rig import Rig, RigCamera
 
 PAPER_TILTS_DEG = ((2.0, 40.0), (1.0, -10.0))
@@ -129,12 +129,17 @@ def known_cam_from_rig(rig: Rig) -> Array:
 
 def nominal_rig(rig: Rig, *, distance_scale: float = 0.5) -> Rig:
     """What a user would write: straight ports, a rough guess of their distances."""
-    ports = [
-        replace(
-            item.port,
-            normal=(0.0, 0.0, 1.0),
-            distance=distance_scale * item.port.distance,
-        )
-        for item in rig.cameras
-    ]
+    ports = [rough_port(c.port, distance_scale=distance_scale) for c in rig.cameras]
     return rig.with_geometry(known_cam_from_rig(rig), ports)
+
+
+def rough_port(
+    port: Port, *, straight: bool = True, distance_scale: float = 0.5
+) -> Port:
+    """A guess of a port: straight or concentric, at a share of its distance."""
+    if isinstance(port, FlatPort):
+        normal = (0.0, 0.0, 1.0) if straight else port.normal
+        return replace(port, normal=normal, distance=distance_scale * port.distance)
+    if isinstance(port, DomePort) and straight:
+        return replace(port, center=(0.0, 0.0, 0.0))
+    return port

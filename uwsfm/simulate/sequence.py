@@ -15,6 +15,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DomePort, NoPort, Port
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate.footprints import footprints
@@ -121,6 +122,21 @@ def frame_names(num_frames: int) -> list[str]:
     return [f"{index + 1:04d}.jpg" for index in range(num_frames)]
 
 
+def _port_truth(port: Port) -> dict[str, Any]:
+    if isinstance(port, NoPort):
+        return {"port": "none"}
+    if isinstance(port, DomePort):
+        place = {"port": "dome", "center_m": port.center, "radius_m": port.radius}
+    else:
+        place = {"port": "flat", "normal": port.normal, "distance_m": port.distance}
+    return {
+        **place,
+        "thickness_m": port.thickness,
+        "glass_index": port.n_glass,
+        "water_index": port.n_water,
+    }
+
+
 def truth_of(spec: SequenceSpec) -> dict[str, Any]:
     """What truth.json holds.
 
@@ -136,10 +152,7 @@ def truth_of(spec: SequenceSpec) -> dict[str, Any]:
         "cameras": [
             {
                 "name": item.name,
-                "normal": list(item.port.normal),
-                "distance_m": item.port.distance,
-                "thickness_m": item.port.thickness,
-                "glass_index": item.port.n_glass,
+                **_port_truth(item.port),
                 "cam_from_rig": pose.tolist(),
             }
             for item, pose in placed

@@ -47,7 +47,7 @@ def error_model(name: str, layout: Layout, state: State) -> ErrorModel:
     dirs = np.empty((len(layout.xy), 3))
     _dirs_from_img(layout.xy, layout.camera, state.lenses, dirs)
     focal = np.sqrt(state.lenses[:, 0] * state.lenses[:, 1])
-    thick, n_air, n_glass, n_water = state.ports[:, 4:].T
+    thick, n_air, n_glass, n_water = state.ports[:, 4:8].T
     if code == POINT_3D:
         centres = rigid3.inverse(state.rig_from_world)[:, 4:]
         reach = np.median(np.linalg.norm(state.points - centres.mean(axis=0), axis=1))

@@ -131,7 +131,9 @@ class State:
         """
         difference = np.zeros((len(self.ports), border.BORDER_SIZE))
         difference[:, border.LENGTH] = self.baselines - reference.baselines
-        for c, (port, other) in enumerate(zip(self.ports, reference.ports, strict=True)):
+        for c, (port, other) in enumerate(
+            zip(self.ports, reference.ports, strict=True)
+        ):
             beyond = port[RADIUS_OR_DISTANCE] - other[RADIUS_OR_DISTANCE]
             if port[KIND] == DOME:
                 difference[c, border.CENTER] = port[:3] - other[:3]
