@@ -29,6 +29,7 @@ from uwsfm.export.summary import (
     write_json,
 )
 from uwsfm.housing_pipeline import refined_rig, require_effect
+from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import checked_rig, housing_warnings, locked, output_folder
 from uwsfm.rig import Rig
 from uwsfm.sfm.colmap_model import FoundModel, find_model
@@ -188,7 +189,7 @@ class _Job:
                 "its images were undistorted; give a model of the raw images"
             )
         for camera, port in zip(self.rig.cameras, refined.scene.ports, strict=True):
-            if port.distance > MAX_DISTANCE_M:
+            if isinstance(port, FlatPort) and port.distance > MAX_DISTANCE_M:
                 raise UwsfmError(
                     f"{found.folder}: the port of camera {camera.name!r} would be "
                     f"{port.distance:.2f} m away from the lens: are the images of the "

@@ -183,7 +183,7 @@ def rig_rows(cameras: Sequence[RefractiveCamera], cam_from_rig: Array) -> RigRow
     return (
         rigid3.matrix_rows(cam_from_rig),
         np.array([camera.lens for camera in cameras]),
-        np.array([camera.port.params for camera in cameras]),
+        np.array([camera.port.row for camera in cameras]),
     )
 
 

@@ -185,7 +185,7 @@ def _scale(
     lengths = [
         float(np.linalg.norm(rig.cam_from_rig[pairs.camera, 4:]))
         if rig.cam_from_rig is not None
-        else rig.baseline_m
+        else float(rig.baseline_m or 0.0)
         for pairs in found
     ]
     ratios = [
