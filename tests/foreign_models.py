@@ -1,15 +1,45 @@
 """COLMAP models as other programs leave them: free poses, pinholes, no rig."""
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from sfm_scenes import model_of
 
 from uwsfm.colmap import Model
 from uwsfm.geometry import rigid3
+from uwsfm.sfm.refine import refine_scene
+from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
+from uwsfm.simulate.trajectories import rich_motion
 
 AIR_TO_WATER = 1.333
+NUM_FRAMES = 10
+
+
+class Dive:
+    """A simulated dive, what the user knows of its rig, and its optimum."""
+
+    def __init__(self) -> None:
+        self.true_rig = sample_rig()
+        options = ObservationOptions(
+            num_points=400, noise_px=0.3, outlier_ratio=0.02, seed=2
+        )
+        relief = Relief(stddev=0.2)
+        simulated = simulate_scene(
+            self.true_rig, rich_motion(NUM_FRAMES), relief, options
+        )
+        self.truth = simulated.truth
+        self.rig = nominal_rig(self.true_rig)
+        self.model = model_of(self.rig, simulated.scene)
+        self.optimum = refine_scene(perturbed(simulated.scene), self.rig).calibration
+
+
+@cache
+def simulated_dive() -> Dive:
+    return Dive()
 
 
 def self_calibrated(

@@ -132,12 +132,15 @@ def _same_or_inside(folder: Path, parent: Path) -> bool:
 
 
 def _image_paths(images: Path, rig: Rig, start: ModelStart) -> list[list[Path]]:
-    """[camera][frame], of which those in the model are there and of the right size."""
-    names = start.model.frame_names
+    """[camera][frame]; those in the model are there, the first of each camera fits."""
+    names, registered = start.model.frame_names, start.model.registered
     paths = [[images / camera.images / n for n in names] for camera in rig.cameras]
-    for c, f in np.argwhere(start.model.registered).tolist():
-        lens = rig.cameras[c].camera
-        fault = image_fault(paths[c][f], (lens.width, lens.height))
+    for c, item in enumerate(rig.cameras):
+        there = [paths[c][f] for f in np.flatnonzero(registered[c])]
+        for path in there:
+            if not path.is_file():
+                raise InputError(f"image {path} of the model does not exist")
+        fault = image_fault(there[0], (item.camera.width, item.camera.height))
         if fault is not None:
             raise InputError(fault)
     return paths

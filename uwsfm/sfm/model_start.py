@@ -14,14 +14,13 @@ from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.absolute_pose import AbsolutePoseOptions, estimate_rig_pose
 from uwsfm.sfm.colmap_model import FoundModel, ImageModel, read_image_model
 from uwsfm.sfm.model_rig import ModelRig, rig_of_model
 
-SUPPORT_PX = 20.0
-"""True error of an observation that supports the pose of its frame: a pinhole's pose is
-wrong by some pixels, a wrong one by hundreds."""
-MIN_SUPPORT = 15
-"""Observations that a frame needs to keep its pose."""
+RESECTION = AbsolutePoseOptions(max_error_px=20.0, min_num_inliers=15)
+"""Of a frame with a wrong pose: among points from pinholes' poses, which are some
+pixels off."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,20 +45,17 @@ def start_from_model(found: FoundModel, rig: Rig) -> ModelStart:
     """
     model = read_image_model(found, rig)
     agreed = rig_of_model(model, rig)
-    poses = _candidates(model, agreed)
-    trusted = model.registered & ~agreed.doubtful
-    trusted[0] &= ~agreed.doubtful.any(axis=0)
     scene = Scene.from_arrays(
         cameras=rig.refractive_cameras(),
         cam_from_rig=agreed.cam_from_rig,
-        rig_from_world=_mean_poses(poses, trusted),
+        rig_from_world=_frame_poses(model, agreed),
         points=agreed.scale * np.nan_to_num(model.points),
         camera_idx=model.camera_idx,
         frame_idx=model.frame_idx,
         point_idx=model.point_idx,
         xy=model.xy,
     )
-    scene, lost = _settled(scene, poses, agreed.doubtful)
+    scene, lost = _resected(scene, np.any(agreed.doubtful, axis=0))
     kept = np.nonzero(~np.isin(model.frame_idx, lost))[0]
     if not len(kept):
         raise InputError(f"{found.folder}: no frame has a pose that its points support")
@@ -67,8 +63,9 @@ def start_from_model(found: FoundModel, rig: Rig) -> ModelStart:
     if lost:
         names = ", ".join(model.frame_names[f] for f in lost[:10])
         warnings.append(
-            f"{len(lost)} frames were left out, because neither of their images has a "
-            f"pose that its points support: {names}{' ...' if len(lost) > 10 else ''}"
+            f"{len(lost)} frames were left out, because the poses of their images "
+            "contradict each other and the points of other frames support none: "
+            f"{names}{' ...' if len(lost) > 10 else ''}"
         )
     errors = model.own_error_px
     return ModelStart(
@@ -91,38 +88,28 @@ def start_from_model(found: FoundModel, rig: Rig) -> ModelStart:
     )
 
 
-def _candidates(model: ImageModel, agreed: ModelRig) -> Array:
-    """(C, F, 7) rig_from_world, metres, as each image alone would have it."""
+def _frame_poses(model: ImageModel, agreed: ModelRig) -> Array:
+    """(F, 7) rig_from_world, metres: the mean over the images of a frame."""
     rig_from_cam = rigid3.inverse(agreed.in_model)
-    poses = rigid3.compose(rig_from_cam[:, None], model.cam_from_world)
+    poses = rigid3.compose(rig_from_cam[:, None], model.cam_from_world)  # (C, F, 7)
     poses[..., 4:] *= agreed.scale
-    return poses
-
-
-def _mean_poses(poses: Array, use: NDArray[np.bool_]) -> Array:
-    """(F, 7) mean over the images used; the identity where there is none."""
-    found = np.tile(rigid3.IDENTITY, (poses.shape[1], 1))
-    for frame in np.nonzero(use.any(axis=0))[0]:
-        mine = poses[use[:, frame], frame]
+    found = np.empty(poses.shape[1:])
+    for frame, there in enumerate(model.registered.T):
+        mine = poses[there, frame]
         rotation = rigid3.rotmat_from_quat(mine[:, :4]).mean(axis=0)
+        found[frame] = rigid3.from_rotmat(rotation, np.zeros(3))
+        # Centres have a mean; translations swing with the rotation, far from zero.
         center = rigid3.inverse(mine)[:, 4:].mean(axis=0)
-        turn = rigid3.from_rotmat(rotation, np.zeros(3))
-        found[frame] = turn
-        found[frame, 4:] = -rigid3.rotate(turn, center)
+        found[frame, 4:] = -rigid3.rotate(found[frame], center)
     return found
 
 
-def _settled(
-    scene: Scene, poses: Array, doubtful: NDArray[np.bool_]
-) -> tuple[Scene, list[int]]:
-    """Give each doubtful frame the pose of the image that its points support.
-
-    The points are those that the other frames see.
+def _resected(scene: Scene, in_doubt: NDArray[np.bool_]) -> tuple[Scene, list[int]]:
+    """Find the poses of the frames in doubt (F,) from points that the others see.
 
     Returns:
-        The scene, and the frames that no image's pose fits.
+        The scene, and the frames without a pose.
     """
-    in_doubt = np.any(doubtful, axis=0)
     if not in_doubt.any():
         return scene, []
     origins, dirs = scene.water_rays()
@@ -130,27 +117,21 @@ def _settled(
     points = triangulate_tracks(origins, dirs, scene.point_idx, scene.num_points)
     rig_from_world = scene.rig_from_world.copy()
     lost = []
-    for frame in np.nonzero(in_doubt)[0].tolist():
-        part, used = scene.select(scene.frame_idx == frame)
-        part = replace(part, points=points[used])
-        support = [
-            _support(part, frame, pose) if np.isfinite(pose).all() else 0
-            for pose in poses[:, frame]
-        ]
-        best = int(np.argmax(support))
-        if support[best] < MIN_SUPPORT:
+    for frame in np.flatnonzero(in_doubt).tolist():
+        rows = np.flatnonzero(scene.frame_idx == frame)
+        found = estimate_rig_pose(
+            scene.cameras,
+            scene.cam_from_rig,
+            scene.camera_idx[rows],
+            scene.xy[rows],
+            points[scene.point_idx[rows]],
+            RESECTION,
+        )
+        if found is None:
             lost.append(frame)
         else:
-            rig_from_world[frame] = poses[best, frame]
+            rig_from_world[frame] = found.rig_from_world
     return replace(scene, rig_from_world=rig_from_world), lost
-
-
-def _support(scene: Scene, frame: int, pose: Array) -> int:
-    """How many observations agree with a pose (7,) of their frame."""
-    poses = scene.rig_from_world.copy()
-    poses[frame] = pose
-    residuals = replace(scene, rig_from_world=poses).residuals()
-    return int(np.count_nonzero(np.sum(residuals**2, axis=1) <= SUPPORT_PX**2))
 
 
 def _with_observations(scene: Scene, rows: IndexArray) -> Scene:

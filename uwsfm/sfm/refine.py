@@ -82,6 +82,9 @@ def refine_scene(
     first = calibrate(part, report=report, **options)
     trusted = np.zeros_like(keep)
     trusted[np.nonzero(keep)[0][first.inliers]] = True
+    # Points that the start was too far off for get another chance, as a whole.
+    lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
+    trusted |= lost[scene.point_idx] & calibrated
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     part, _ = scene.select(_require(keep, scene))
