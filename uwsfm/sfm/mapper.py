@@ -63,7 +63,7 @@ def map_images(
                 mapping_path,
                 frames.image_dir,
                 scratch,
-                options=_pipeline_options(options, free),
+                options=_pipeline_options(options, frames, free),
                 initial_image_pair_callback=began,
                 next_image_callback=went_on,
                 cancellation_token=token,
@@ -84,7 +84,7 @@ def map_images(
 
 
 def _pipeline_options(
-    options: StartOptions, free: bool
+    options: StartOptions, frames: Frames, free: bool
 ) -> pycolmap.IncrementalPipelineOptions:
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.ba_refine_focal_length = False
@@ -100,7 +100,9 @@ def _pipeline_options(
     pipeline.num_threads = 1
     pipeline.mapper.init_min_num_inliers = MIN_INIT_INLIERS
     pipeline.mapper.init_min_tri_angle = (
-        MIN_INIT_ANGLE_FREE_DEG if free else MIN_INIT_ANGLE_DEG
+        MIN_INIT_ANGLE_FREE_DEG
+        if free or len(frames.folders) == 1
+        else MIN_INIT_ANGLE_DEG
     )
     pipeline.mapper.filter_max_reproj_error = options.mapping.max_error_px
     pipeline.mapper.filter_min_tri_angle = options.mapping.min_angle_deg

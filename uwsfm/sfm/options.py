@@ -113,11 +113,18 @@ class StartOptions:
     matching: MatchOptions = field(default_factory=MatchOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
+    scene_distance_m: float = 1.0
+    """Of a single camera, about; two or more measure it. It sets the scale that the
+    start begins with, and how large refraction is there."""
     seed: int = 0
     num_threads: int = -1
     """-1: all cores. Mapping takes one, so that it is repeatable."""
 
     def __post_init__(self) -> None:
+        if not 0.0 < self.scene_distance_m < math.inf:
+            raise InputError(
+                f"scene_distance_m must be positive, got {self.scene_distance_m}"
+            )
         if self.num_threads == 0 or self.num_threads < -1:
             raise InputError(
                 f"num_threads must be positive, or -1 for all cores, "

@@ -64,12 +64,19 @@ def correct_rotations(
     the perspective; a weak prior holds them where the images do not tell.
 
     Args:
-        cameras: With initial ports.
+        cameras: With initial ports. One alone stays where it is.
         cam_from_rig: Poses (C, 7) to start from.
         pairs: Matches of the same frame, at least `MIN_RIG_MATCHES` in one of them.
     """
-    used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
     num_cameras = len(cameras)
+    if num_cameras == 1:
+        return RigRotation(
+            cam_from_rig=np.asarray(cam_from_rig),
+            turn_deg=np.zeros(1),
+            misfit_before=0.0,
+            misfit_after=0.0,
+        )
+    used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
 
     def turned(delta: Array) -> Array:
         tangent = np.zeros((num_cameras, 6))

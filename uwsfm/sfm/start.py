@@ -33,6 +33,9 @@ from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import read_same_frame_matches
 from uwsfm.sfm.steps import Steps
 
+NEAR_TO_FAR = (0.7, 1.0, 1.4)
+"""Depths of the scene of a single camera, by its distance: nothing measures them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Workspace:
@@ -130,6 +133,8 @@ def start_from_matches(
     """
     space = Workspace(work_dir=steps.work_dir)
     geometry = [_rig_content(rig), asdict(options.verification), options.seed]
+    if len(rig.cameras) == 1:
+        geometry.append(options.scene_distance_m)
     if rig.cam_from_rig is None:
         key = steps.run(
             "rig",
@@ -143,7 +148,7 @@ def start_from_matches(
 
     @cache
     def fixed() -> _FixedRig:
-        return _fix_rig(rig, poses, frames, space)
+        return _fix_rig(rig, poses, frames, space, options.scene_distance_m)
 
     def verify() -> None:
         write_mapping_database(
@@ -270,14 +275,20 @@ def _derive_rig(
         partial.write_text(json.dumps(poses.tolist()), encoding="utf-8")
 
 
-def _fix_rig(rig: Rig, poses: Array, frames: Frames, space: Workspace) -> _FixedRig:
+def _fix_rig(
+    rig: Rig, poses: Array, frames: Frames, space: Workspace, scene_distance_m: float
+) -> _FixedRig:
     """Check the rig against its images, turn it to fit them, and fit the pinholes."""
-    pairs = read_same_frame_matches(space.features, frames, rig)
-    check_rig(rig, poses, pairs)
     cameras = rig.refractive_cameras()
+    pairs = read_same_frame_matches(space.features, frames, rig)
+    if len(cameras) > 1:
+        check_rig(rig, poses, pairs)
     rotation = correct_rotations(cameras, poses, pairs)
-    check_rotation(rig, rotation, pairs)
-    depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
+    if len(cameras) > 1:
+        check_rotation(rig, rotation, pairs)
+        depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
+    else:
+        depths = scene_distance_m * np.array([NEAR_TO_FAR])
     pinholes = tuple(
         fit_virtual_pinhole(camera, depths[c]) for c, camera in enumerate(cameras)
     )
@@ -298,6 +309,8 @@ def _map(
     progress: Progress,
 ) -> None:
     models = map_images(space.mapping, frames, options, progress=progress)
+    if len(rig.cameras) == 1:
+        _scale_to(models[0], options.scene_distance_m)
     write_start(
         space.perspective,
         models[0],
@@ -306,6 +319,19 @@ def _map(
         fixed.depths,
         _summary(rig, frames, fixed, models),
     )
+
+
+def _scale_to(model: pycolmap.Reconstruction, scene_distance_m: float) -> None:
+    """Put the points of a model at this median depth: its scale is arbitrary."""
+    depths = []
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        seen = [p.point3D_id for p in image.points2D if p.has_point3D()]
+        points = np.array([model.points3D[i].xyz for i in seen]).reshape(-1, 3)
+        pose = image.cam_from_world()
+        depths.append(points @ pose.rotation.matrix()[2] + pose.translation[2])
+    scale = scene_distance_m / float(np.median(np.concatenate(depths)))
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
 
 
 def _summary(
