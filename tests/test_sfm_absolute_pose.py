@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from jacobians import check_jacobian, tilted
 
-from uwsfm import FlatPort, InputError, RefractiveCamera
+from uwsfm import DomePort, FlatPort, InputError, RefractiveCamera
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.p3p import poses_from_three
 from uwsfm.sfm.absolute_pose import (
@@ -36,12 +36,19 @@ def one_camera():
     return [camera()], np.array([rigid3.IDENTITY])
 
 
+def behind_a_dome():
+    """Decentred by twice its thickness."""
+    port = DomePort((0.01, -0.01, 0.02), 0.06, 0.01, 1.52, 1.334)
+    return [camera().with_port(port)], np.array([rigid3.IDENTITY])
+
+
 def four_cameras():
-    """Looking around, 0.3 m apart: no common centre."""
+    """Looking around, 0.3 m apart, flat ports and a dome: no common centre."""
     turns = np.array([[0, 0, 0], [0, 0.5, 0], [0.4, 0, 0.3], [0, -0.6, 0.1]])
     shifts = 0.3 * np.array([[0, 0, 0], [-1, 0, 0], [0, -1, 0.5], [1, 1, 0]])
     poses = np.concatenate([rigid3.quat_from_rotvec(turns), shifts], axis=1)
-    return [camera(tilt, 0.02) for tilt in (0.0, 3.0, 6.0, 9.0)], poses
+    cameras = [camera(tilt, 0.02) for tilt in (0.0, 3.0, 6.0)]
+    return [*cameras, *behind_a_dome()[0]], poses
 
 
 def simulated(rig, rng, num=200, noise_px=0.0, wrong=0.0):
@@ -72,7 +79,7 @@ def offset(pose, truth) -> np.ndarray:
     return np.concatenate([rotvec, pose[4:] - turned[4:]])
 
 
-@pytest.mark.parametrize("rig", [one_camera, four_cameras])
+@pytest.mark.parametrize("rig", [one_camera, behind_a_dome, four_cameras])
 @pytest.mark.parametrize("wrong", [0.0, 0.6])
 def test_exact_without_noise(rig, wrong, rng):
     args, truth, right = simulated(rig(), rng, wrong=wrong)

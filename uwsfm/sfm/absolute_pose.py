@@ -16,17 +16,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.rays import finite_rows, triangulate_tracks
+from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.absolute_pose_ransac import search_pose, trials_needed
+from uwsfm.sfm.kernel_rows import (
+    IndexArray,
+    RigRows,
+    checked_views,
+    near_rays,
+    rays_in_rig,
+    rig_rows,
+)
 from uwsfm.solver.losses import LOSS_CODES
-from uwsfm.solver.rig_pose import refine_pose, squared_errors
+from uwsfm.solver.rig_pose import covariance_from_hessian, refine_pose, squared_errors
 
 Mask = NDArray[np.bool_]
-IndexArray = NDArray[np.int64]
 Matches = tuple[Array, IndexArray, Array]
-RigRows = tuple[Array, Array, Array]
 
 CHUNK = 64
 """Samples drawn at once: what is drawn does not depend on when the search ends."""
@@ -112,7 +118,8 @@ def estimate_rig_pose(
     """
     options = options or AbsolutePoseOptions()
     matches, rig = checked(cameras, cam_from_rig, camera_idx, xy, points)
-    rays = _near_rays(cameras, rig[0], matches)
+    rays, _ = near_rays(cameras, matches[1], matches[2])
+    rays = rays_in_rig(rays, matches[1], np.asarray(cam_from_rig, dtype=np.float64))
     usable = finite_rows(rays) & finite_rows(matches[0])
     rows = np.flatnonzero(usable)
     if len(rows) < options.min_num_inliers:
@@ -159,57 +166,12 @@ def checked(
     Raises:
         InputError: as of `estimate_rig_pose`.
     """
-    poses = np.asarray(cam_from_rig, dtype=np.float64)
-    index = np.ascontiguousarray(camera_idx, dtype=np.int64)
-    pixels = np.ascontiguousarray(xy, dtype=np.float64)
+    rig, _ = rig_rows(cameras, cam_from_rig)
+    index, pixels = checked_views(len(cameras), camera_idx, xy)
     world = np.ascontiguousarray(points, dtype=np.float64)
-    num = len(index)
-    expected = {
-        "cam_from_rig": (poses, (len(cameras), 7)),
-        "camera_idx": (index, (num,)),
-        "xy": (pixels, (num, 2)),
-        "points": (world, (num, 3)),
-    }
-    for name, (array, shape) in expected.items():
-        if array.shape != shape:
-            raise InputError(f"{name}.shape={array.shape}, expected {shape}")
-    if num and not (index.min() >= 0 and index.max() < len(cameras)):
-        raise InputError(f"camera_idx must be in 0..{len(cameras) - 1}")
-    return (world, index, pixels), rig_rows(cameras, poses)
-
-
-def rig_rows(cameras: Sequence[RefractiveCamera], cam_from_rig: Array) -> RigRows:
-    """Rows of cam_from_rig (C, 12), lenses and ports, as the kernels read them."""
-    return (
-        rigid3.matrix_rows(cam_from_rig),
-        np.array([camera.lens for camera in cameras]),
-        np.array([camera.port.row for camera in cameras]),
-    )
-
-
-def _near_rays(
-    cameras: Sequence[RefractiveCamera], cams: Array, matches: Matches
-) -> Array:
-    """Water rays (N, 6) in the rig, NaN where there is none.
-
-    Their origins are moved, along the rays, to where those of a camera nearly meet.
-    """
-    _, index, xy = matches
-    rays = np.full((len(xy), 6), np.nan)
-    for c, camera in enumerate(cameras):
-        rows = np.flatnonzero(index == c)
-        if not len(rows):
-            continue
-        origins, dirs = camera.ray_from_img(xy[rows])
-        centre = triangulate_tracks(origins, dirs, np.zeros(len(rows), np.int64), 1)[0]
-        if not np.isfinite(centre).all():  # a single ray, or none
-            centre = np.zeros(3)
-        along = np.einsum("ni,ni->n", centre - origins, dirs)
-        origins += along[:, None] * dirs
-        placed = cams[c].reshape(3, 4)
-        rays[rows, :3] = (origins - placed[:, 3]) @ placed[:, :3]
-        rays[rows, 3:] = dirs @ placed[:, :3]
-    return rays
+    if world.shape != (len(index), 3):
+        raise InputError(f"points.shape={world.shape}, expected ({len(index)}, 3)")
+    return (world, index, pixels), rig
 
 
 def _search(
@@ -287,7 +249,7 @@ def _refined(
         num_inliers=num_inliers,
         errors_px=np.sqrt(squares),
         noise_px=noise,
-        covariance=_covariance(hessian, noise),
+        covariance=covariance_from_hessian(hessian, noise),
         num_trials=num_trials,
     )
 
@@ -295,14 +257,3 @@ def _refined(
 def _noise_px(squares: Array, inliers: Mask) -> float:
     median = float(np.sqrt(np.median(squares[inliers])))
     return max(median / MEDIAN_ERROR, NOISE_FLOOR_PX)
-
-
-def _covariance(hessian: Array, noise_px: float) -> Array:
-    lower = np.tril(hessian)
-    full = lower + np.tril(hessian, -1).T
-    # In units of its own diagonal: rotations are radians, translations metres.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(full), 1e-300))
-    values, vectors = np.linalg.eigh(full * np.outer(scale, scale))
-    if not values[0] > 1e-12:
-        return np.full((6, 6), np.inf)
-    return noise_px**2 * ((vectors / values) @ vectors.T) * np.outer(scale, scale)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from uwsfm._jit import kernel
+from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
 from uwsfm.residuals.reprojection import residual
@@ -17,6 +18,8 @@ from uwsfm.solver.losses import INVALID_PX, rho
 POSE_SIZE = 6
 MIN_DIAGONAL = 1e-12
 MAX_DAMPING = 1e10
+MIN_EIGENVALUE = 1e-12
+"""Of a scaled Hessian: what is smaller is rounding."""
 MIN_RELATIVE_DECREASE = 1e-7
 """Of some hundred observations: one hundredth of a standard deviation of the pose."""
 
@@ -208,3 +211,14 @@ def refine_pose(pose, matches, use, rig, loss, scale, max_iterations):
         if small or not cost > 1e-22 * len(use):
             break
     return cost, hessian
+
+
+def covariance_from_hessian(hessian: Array, noise: float) -> Array:
+    """noise^2 H^-1 (K, K) of a lower triangle; inf if H is singular to rounding."""
+    full = np.tril(hessian) + np.tril(hessian, -1).T
+    # In units of its own diagonal: rotations are radians, translations metres.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(full), 1e-300))
+    values, vectors = np.linalg.eigh(full * np.outer(scale, scale))
+    if not values[0] > MIN_EIGENVALUE:
+        return np.full(full.shape, np.inf)
+    return noise**2 * ((vectors / values) @ vectors.T) * np.outer(scale, scale)
