@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from sfm_scenes import frames_of, same_frame_matches, simulated_dive, write_features
+from sfm_scenes import same_frame_matches, simulated_dive
 from test_three_cameras import three_camera_rig
 
 from uwsfm import InputError, calibrate
@@ -19,6 +19,7 @@ from uwsfm.sfm.matching import match_features
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
 from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
+from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.simulate import Relief, SimulatedScene, simulate_scene
 from uwsfm.simulate.observations import ObservationOptions
 from uwsfm.simulate.rigs import nominal_rig, sample_rig

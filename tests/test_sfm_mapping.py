@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sfm_scenes import frames_of, simulated_dive, write_features
+from sfm_scenes import simulated_dive
 
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
@@ -17,6 +17,7 @@ from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
 from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
+from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate import SimulatedScene

@@ -116,6 +116,10 @@ def reconstruct(
         Literal["colmap", "paper"],
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
     ] = "colmap",
+    mapper: Annotated[
+        Literal["pinhole", "refractive"],
+        typer.Option(help="refractive: water rays in every step, not only the last."),
+    ] = "pinhole",
     seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
@@ -135,6 +139,7 @@ def reconstruct(
             masks=masks,
             matching=matching,
             matcher=matcher,
+            mapper=mapper,
             seed=seed,
             num_threads=threads,
             progress=progress,

@@ -37,7 +37,6 @@ from uwsfm.sfm.colmap_model import find_model
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.model_start import ModelStart, start_from_model
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.perspective import read_start
 from uwsfm.sfm.refine import refine_scene, rig_options
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import Workspace, match_images, perspective_start
@@ -147,7 +146,7 @@ class _Job:
         start = perspective_start(
             self.rig, self.source, self.out / WORK, self.front_end, self.progress
         )
-        return start_scene(self.rig, start, read_start(start))
+        return start_scene(self.rig, start, start.arrays())
 
     def _from_pairs(self) -> CalibrationResult:
         """Normals from single stereo pairs: section 3.2.1."""

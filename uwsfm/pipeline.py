@@ -32,14 +32,15 @@ from uwsfm.sfm.colors import point_colors
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.options import (
     FeatureOptions,
+    Mapper,
     Matcher,
     Matching,
     MatchOptions,
     StartOptions,
 )
-from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
+from uwsfm.sfm.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, refine_scene
-from uwsfm.sfm.start import perspective_start
+from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
 WORK = "uwsfm-work"
@@ -57,7 +58,7 @@ class ReconstructResult:
     summary: dict[str, Any]
     """summary.json"""
     start: StartArrays
-    """The perspective start, which pinholes fitted to the ports made."""
+    """Where the mapper ended, before the refractive adjustment."""
 
 
 def reconstruct(
@@ -69,6 +70,7 @@ def reconstruct(
     masks: str | Path | None = None,
     matching: Matching = "auto",
     matcher: Matcher = "colmap",
+    mapper: Mapper = "pinhole",
     seed: int = 0,
     num_threads: int = -1,
     progress: Progress = silent,
@@ -88,6 +90,8 @@ def reconstruct(
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
         matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
+        mapper: "pinhole": COLMAP's, with pinholes fitted to the ports; "refractive":
+            water rays in every step, where pinholes do not get far.
         seed: Of all random choices.
         num_threads: -1 for all cores.
         progress: Called with each long step.
@@ -102,6 +106,7 @@ def reconstruct(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)
         ),
         matching=MatchOptions(strategy=matching, matcher=matcher),
+        mapper=mapper,
         seed=seed,
         num_threads=num_threads,
     )
@@ -116,7 +121,7 @@ def _reconstruct(
     start = perspective_start(rig, images, out / WORK, options, progress)
     timings = dict(start.summary["timings_s"])
     clock = time.perf_counter()
-    arrays = read_start(start)
+    arrays = start.arrays()
     refined = refine_scene(start_scene(rig, start, arrays), rig, progress)
     timings["refractive adjustment"] = time.perf_counter() - clock
     clock = time.perf_counter()
@@ -190,12 +195,12 @@ def locked(out: Path) -> Iterator[None]:
         lock.release()
 
 
-def start_scene(rig: Rig, start: PerspectiveStart, arrays: StartArrays) -> Scene:
+def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:
     placement = start.cam_from_rig
     if rig.cam_from_rig is not None and not rig.refine_cam_from_rig:
         placement = rig.cam_from_rig
     return Scene.from_arrays(
-        cameras=rig.refractive_cameras(),
+        cameras=start.cameras(rig),
         cam_from_rig=placement,
         rig_from_world=arrays.rig_from_world,
         points=arrays.points,
@@ -226,26 +231,26 @@ def _model(
 
 def _summary(
     model: Model,
-    start: PerspectiveStart,
+    start: Start,
     refined: Refined,
     timings: dict[str, float],
 ) -> dict[str, Any]:
-    perspective = dict(start.summary)
+    mapped = dict(start.summary)
     cameras = housing_summary(model.rig, refined.calibration)
-    warnings = perspective.pop("warnings")
+    warnings = mapped.pop("warnings")
     warnings += housing_warnings(model.rig, refined.calibration)
-    del perspective["timings_s"]
+    del mapped["timings_s"]
     found = errors_summary(refined.calibration)
     after = found.pop("reprojection_rms_px")
     return {
-        "num_frames": perspective.pop("num_frames"),
-        "unregistered_frames": perspective.pop("unregistered_frames"),
+        "num_frames": mapped.pop("num_frames"),
+        "unregistered_frames": mapped.pop("unregistered_frames"),
         **found,
         "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},
         "cameras": cameras,
         "baseline_m": model.rig.baseline_m,
         "baseline_stddev_m": model.rig.baseline_stddev_m,
-        "perspective_start": perspective,
+        f"{start.kind}_start": mapped,
         "warnings": warnings,
         "timings_s": timings,
         "versions": versions(),

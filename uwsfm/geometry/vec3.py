@@ -19,3 +19,13 @@ def add(p, step, q):
 def scaled(factor, p):
     """factor p"""
     return factor * p[0], factor * p[1], factor * p[2]
+
+
+@kernel
+def cross(p, q):
+    """p x q"""
+    return (
+        p[1] * q[2] - p[2] * q[1],
+        p[2] * q[0] - p[0] * q[2],
+        p[0] * q[1] - p[1] * q[0],
+    )

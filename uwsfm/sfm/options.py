@@ -12,6 +12,7 @@ from uwsfm.errors import InputError
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]
+Mapper = Literal["pinhole", "refractive"]
 
 
 def thread_count(num_threads: int) -> int:
@@ -116,11 +117,19 @@ class StartOptions:
     scene_distance_m: float = 1.0
     """Of a single camera, about; two or more measure it. It sets the scale that the
     start begins with, and how large refraction is there."""
+    mapper: Mapper = "pinhole"
+    """"pinhole": COLMAP's, with pinholes fitted to the ports; "refractive": water rays
+    in every step."""
     seed: int = 0
     num_threads: int = -1
     """-1: all cores. Mapping takes one, so that it is repeatable."""
 
     def __post_init__(self) -> None:
+        if self.mapper not in get_args(Mapper):
+            raise InputError(
+                f"mapper must be one of {', '.join(get_args(Mapper))}, "
+                f"got {self.mapper!r}"
+            )
         if not 0.0 < self.scene_distance_m < math.inf:
             raise InputError(
                 f"scene_distance_m must be positive, got {self.scene_distance_m}"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pycolmap
@@ -15,6 +15,8 @@ from uwsfm._files import replaced_dir
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.background import damaged, opened
 from uwsfm.sfm.images import Frames
@@ -45,10 +47,20 @@ class PerspectiveStart:
     summary: dict[str, Any] = field(default_factory=dict)
     """Numbers for the report; see `summary.json`."""
 
+    kind: ClassVar[str] = "perspective"
+
+    def cameras(self, rig: Rig) -> tuple[RefractiveCamera, ...]:
+        """The rig's cameras: a pinhole knows nothing better of the ports."""
+        return rig.refractive_cameras()
+
+    def arrays(self) -> StartArrays:
+        """See `read_start`."""
+        return read_start(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class StartArrays:
-    """A perspective start as arrays, in the frames of the real rig."""
+    """Where mapping ended as arrays, in the frames of the real rig."""
 
     frame_names: tuple[str, ...]
     """(F,) registered frames, in the order of `Frames.names`."""
@@ -147,7 +159,7 @@ def read_start(start: PerspectiveStart) -> StartArrays:
         [_pose(model.frames[frame_of[f]].rig_from_world) for f in registered]
     )
     table = _observation_table(model, frames, index_of)
-    keypoints = _real_keypoints(start.features_path, frames, registered)
+    keypoints = real_keypoints(start.features_path, frames, registered)
     return StartArrays(
         frame_names=tuple(frames.names[f] for f in registered),
         rig_from_world=rigid3.compose(rig_from_virtual_rig[None], virtual_poses),
@@ -179,9 +191,10 @@ def _observation_table(
     return np.array(sorted(rows, key=lambda row: (row[2], row[1], row[0])), np.int64)
 
 
-def _real_keypoints(
+def real_keypoints(
     features_path: Path, frames: Frames, registered: Sequence[int]
 ) -> tuple[tuple[Array, ...], ...]:
+    """[camera][frame] -> (n, 2) keypoints of some frames, from their database."""
     with opened(features_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         return tuple(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -16,25 +15,29 @@ import pycolmap
 
 from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
-from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import ENHANCED, extract_features, store_intrinsics
+from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
 from uwsfm.sfm.images import Frames, check_images, check_masks, find_frames
 from uwsfm.sfm.mapper import map_images
+from uwsfm.sfm.mapping.correspondences import read_correspondences
+from uwsfm.sfm.mapping.incremental import map_incrementally
+from uwsfm.sfm.mapping.refractive_start import (
+    RefractiveStart,
+    load_refractive_start,
+    write_refractive_start,
+)
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
 from uwsfm.sfm.options import FeatureOptions, StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
-from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
-from uwsfm.sfm.rig_check import check_rig, check_rotation
-from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
-from uwsfm.sfm.same_frame import read_same_frame_matches
+from uwsfm.sfm.refine import rig_options
 from uwsfm.sfm.steps import Steps
 
-NEAR_TO_FAR = (0.7, 1.0, 1.4)
-"""Depths of the scene of a single camera, by its distance: nothing measures them."""
+Start = PerspectiveStart | RefractiveStart
+"""Where mapping ended, by the mapper that was asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,15 +70,10 @@ class Workspace:
         """The perspective model."""
         return self.work_dir / "perspective"
 
-
-@dataclass(frozen=True, kw_only=True)
-class _FixedRig:
-    """The rig as the mapper holds it."""
-
-    rotation: RigRotation
-    depths: Array
-    pinholes: tuple[VirtualPinhole, ...]
-    num_matches: int
+    @property
+    def refractive(self) -> Path:
+        """The map of the refraction-aware mapper."""
+        return self.work_dir / "refractive"
 
 
 def perspective_start(
@@ -84,7 +82,7 @@ def perspective_start(
     work_dir: Path,
     options: StartOptions | None = None,
     progress: Progress = silent,
-) -> PerspectiveStart:
+) -> Start:
     """Register the images of a rig with pinholes that resemble its ports.
 
     Steps whose inputs have not changed since they were finished in ``work_dir`` are
@@ -116,7 +114,7 @@ def start_from_matches(
     key: str,
     options: StartOptions,
     progress: Progress = silent,
-) -> PerspectiveStart:
+) -> Start:
     """`perspective_start`, from a workspace whose database holds raw matches.
 
     Args:
@@ -147,8 +145,8 @@ def start_from_matches(
         poses = np.asarray(rig.cam_from_rig)
 
     @cache
-    def fixed() -> _FixedRig:
-        return _fix_rig(rig, poses, frames, space, options.scene_distance_m)
+    def fixed() -> FixedRig:
+        return fix_rig(rig, poses, frames, space.features, options.scene_distance_m)
 
     def verify() -> None:
         write_mapping_database(
@@ -163,17 +161,23 @@ def start_from_matches(
         )
 
     key = steps.run("verification", [key, geometry], verify, outputs=[space.mapping])
-    steps.run(
-        "mapping",
-        [key, asdict(options.mapping)],
-        lambda: _map(rig, frames, fixed(), space, options, progress),
-        outputs=[space.perspective],
-    )
-    return _loaded(space, frames, steps)
-
-
-def _loaded(space: Workspace, frames: Frames, steps: Steps) -> PerspectiveStart:
-    start = load_start(space.perspective, space.features, frames)
+    start: Start
+    if options.mapper == "refractive":
+        steps.run(
+            "mapping",
+            [key, "refractive", asdict(options.mapping), _refined_content(rig)],
+            lambda: _map_refractive(rig, frames, fixed(), space, options, progress),
+            outputs=[space.refractive],
+        )
+        start = load_refractive_start(space.refractive, space.features, frames)
+    else:
+        steps.run(
+            "mapping",
+            [key, asdict(options.mapping)],
+            lambda: _map(rig, frames, fixed(), space, options, progress),
+            outputs=[space.perspective],
+        )
+        start = load_start(space.perspective, space.features, frames)
     start.summary["timings_s"] = steps.seconds()
     return start
 
@@ -261,6 +265,14 @@ def _rig_content(rig: Rig) -> list[Any]:
     return [rows, None if poses is None else poses.tolist(), rig.baseline_m]
 
 
+def _refined_content(rig: Rig) -> list[Any]:
+    """What the refractive mapper may refine, and which pixels it may use, JSON."""
+    return [
+        rig_options(rig),
+        [camera.valid_radius_px for camera in rig.cameras],
+    ]
+
+
 def _derive_rig(
     rig: Rig,
     frames: Frames,
@@ -275,35 +287,10 @@ def _derive_rig(
         partial.write_text(json.dumps(poses.tolist()), encoding="utf-8")
 
 
-def _fix_rig(
-    rig: Rig, poses: Array, frames: Frames, space: Workspace, scene_distance_m: float
-) -> _FixedRig:
-    """Check the rig against its images, turn it to fit them, and fit the pinholes."""
-    cameras = rig.refractive_cameras()
-    pairs = read_same_frame_matches(space.features, frames, rig)
-    if len(cameras) > 1:
-        check_rig(rig, poses, pairs)
-    rotation = correct_rotations(cameras, poses, pairs)
-    if len(cameras) > 1:
-        check_rotation(rig, rotation, pairs)
-        depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
-    else:
-        depths = scene_distance_m * np.array([NEAR_TO_FAR])
-    pinholes = tuple(
-        fit_virtual_pinhole(camera, depths[c]) for c, camera in enumerate(cameras)
-    )
-    return _FixedRig(
-        rotation=rotation,
-        depths=depths,
-        pinholes=pinholes,
-        num_matches=sum(len(pair) for pair in pairs),
-    )
-
-
 def _map(
     rig: Rig,
     frames: Frames,
-    fixed: _FixedRig,
+    fixed: FixedRig,
     space: Workspace,
     options: StartOptions,
     progress: Progress,
@@ -311,13 +298,27 @@ def _map(
     models = map_images(space.mapping, frames, options, progress=progress)
     if len(rig.cameras) == 1:
         _scale_to(models[0], options.scene_distance_m)
+    best = models[0]
+    registered = {best.images[i].name.rpartition("/")[2] for i in best.reg_image_ids()}
+    summary = {
+        "num_points": best.num_points3D(),
+        "num_observations": best.compute_num_observations(),
+        "mean_error_px": best.compute_mean_reprojection_error(),
+        **mapping_summary(
+            rig,
+            frames,
+            fixed,
+            registered,
+            [model.num_reg_frames() for model in models[1:]],
+        ),
+    }
     write_start(
         space.perspective,
-        models[0],
+        best,
         fixed.rotation.cam_from_rig,
         fixed.pinholes,
         fixed.depths,
-        _summary(rig, frames, fixed, models),
+        summary,
     )
 
 
@@ -334,44 +335,26 @@ def _scale_to(model: pycolmap.Reconstruction, scene_distance_m: float) -> None:
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
 
 
-def _summary(
+def _map_refractive(
     rig: Rig,
     frames: Frames,
-    fixed: _FixedRig,
-    models: Sequence[pycolmap.Reconstruction],
-) -> dict[str, Any]:
-    best = models[0]
-    registered = {best.images[i].name.rpartition("/")[2] for i in best.reg_image_ids()}
-    missing = [name for name in frames.names if name not in registered]
-    others = [model.num_reg_frames() for model in models[1:]]
-    warnings = frames.warnings() + fixed.rotation.warnings(rig)
-    if missing:
-        warnings.append(
-            f"{len(missing)} of {len(frames.names)} frames could not be registered: "
-            f"{', '.join(missing[:10])}{' ...' if len(missing) > 10 else ''}"
-        )
-    if others:
-        warnings.append(
-            f"smaller models were left out ({len(others)}), of "
-            f"{', '.join(str(size) for size in others[:10])} frames"
-        )
-    focal = float(np.mean([pinhole.focal_px for pinhole in fixed.pinholes]))
-    return {
-        "num_frames": len(frames.names),
-        "num_registered_frames": best.num_reg_frames(),
-        "unregistered_frames": missing,
-        "other_model_frames": others,
-        "num_points": best.num_points3D(),
-        "num_observations": best.compute_num_observations(),
-        "mean_error_px": best.compute_mean_reprojection_error(),
-        "num_same_frame_matches": fixed.num_matches,
-        "depth_percentiles_m": fixed.depths.tolist(),
-        "rig_turn_deg": fixed.rotation.turn_deg.tolist(),
-        "same_frame_misfit_px": {
-            "before_turn": focal * fixed.rotation.misfit_before,
-            "after_turn": focal * fixed.rotation.misfit_after,
-        },
-        "pinhole_rms_px": [pinhole.rms_px for pinhole in fixed.pinholes],
-        "pinhole_max_px": [pinhole.max_px for pinhole in fixed.pinholes],
-        "warnings": warnings,
+    fixed: FixedRig,
+    space: Workspace,
+    options: StartOptions,
+    progress: Progress,
+) -> None:
+    maps = map_incrementally(
+        read_correspondences(space.features, space.mapping, frames, rig),
+        rig,
+        fixed.rotation.cam_from_rig,
+        options,
+        progress,
+    )
+    best = maps[0]
+    registered = {frames.names[f] for f in np.flatnonzero(best.registered)}
+    others = [int(other.registered.sum()) for other in maps[1:]]
+    summary = {
+        **best.counts(),
+        **mapping_summary(rig, frames, fixed, registered, others),
     }
+    write_refractive_start(space.refractive, best, summary)

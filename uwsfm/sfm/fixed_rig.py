@@ -1,0 +1,118 @@
+"""The rig that mapping begins with: checked, turned to fit its images, as pinholes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.rig import Rig
+from uwsfm.sfm.images import Frames
+from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
+from uwsfm.sfm.rig_check import check_rig, check_rotation
+from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
+from uwsfm.sfm.same_frame import read_same_frame_matches
+
+NEAR_TO_FAR = (0.7, 1.0, 1.4)
+"""Depths of the scene of a single camera, by its distance: nothing measures them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedRig:
+    """The rig as a mapper begins with it."""
+
+    rotation: RigRotation
+    depths: Array
+    pinholes: tuple[VirtualPinhole, ...]
+    num_matches: int
+
+
+def fix_rig(
+    rig: Rig,
+    poses: Array,
+    frames: Frames,
+    features_path: Path,
+    scene_distance_m: float,
+) -> FixedRig:
+    """Check the rig against its images, turn it to fit them, and fit the pinholes.
+
+    Args:
+        rig: Lenses and initial ports.
+        poses: (C, 7) of its cameras.
+        frames: The images.
+        features_path: Database with keypoints and raw matches.
+        scene_distance_m: Of the scene of a single camera, about.
+
+    Raises:
+        InputError: the rig contradicts the matches.
+    """
+    cameras = rig.refractive_cameras()
+    pairs = read_same_frame_matches(features_path, frames, rig)
+    if len(cameras) > 1:
+        check_rig(rig, poses, pairs)
+    rotation = correct_rotations(cameras, poses, pairs)
+    if len(cameras) > 1:
+        check_rotation(rig, rotation, pairs)
+        depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
+    else:
+        depths = scene_distance_m * np.array([NEAR_TO_FAR])
+    pinholes = tuple(
+        fit_virtual_pinhole(camera, depths[c]) for c, camera in enumerate(cameras)
+    )
+    return FixedRig(
+        rotation=rotation,
+        depths=depths,
+        pinholes=pinholes,
+        num_matches=sum(len(pair) for pair in pairs),
+    )
+
+
+def mapping_summary(
+    rig: Rig,
+    frames: Frames,
+    fixed: FixedRig,
+    registered: Set[str],
+    others: Sequence[int],
+) -> dict[str, Any]:
+    """What there is to say of any mapper.
+
+    Args:
+        rig: Its names.
+        frames: All of them.
+        fixed: The rig as the mapper began with it.
+        registered: Names of frames.
+        others: Numbers of frames of the smaller models.
+    """
+    missing = [name for name in frames.names if name not in registered]
+    warnings = frames.warnings() + fixed.rotation.warnings(rig)
+    if missing:
+        warnings.append(
+            f"{len(missing)} of {len(frames.names)} frames could not be registered: "
+            f"{', '.join(missing[:10])}{' ...' if len(missing) > 10 else ''}"
+        )
+    if others:
+        warnings.append(
+            f"smaller models were left out ({len(others)}), of "
+            f"{', '.join(str(size) for size in others[:10])} frames"
+        )
+    focal = float(np.mean([pinhole.focal_px for pinhole in fixed.pinholes]))
+    return {
+        "num_frames": len(frames.names),
+        "num_registered_frames": len(registered),
+        "unregistered_frames": missing,
+        "other_model_frames": list(others),
+        "num_same_frame_matches": fixed.num_matches,
+        "depth_percentiles_m": fixed.depths.tolist(),
+        "rig_turn_deg": fixed.rotation.turn_deg.tolist(),
+        "same_frame_misfit_px": {
+            "before_turn": focal * fixed.rotation.misfit_before,
+            "after_turn": focal * fixed.rotation.misfit_after,
+        },
+        "pinhole_rms_px": [pinhole.rms_px for pinhole in fixed.pinholes],
+        "pinhole_max_px": [pinhole.max_px for pinhole in fixed.pinholes],
+        "warnings": warnings,
+    }

@@ -1,0 +1,127 @@
+"""Bundle adjustment of a map that still grows: some frames, or all and the housings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwsfm.calibration.priors import border_priors
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.models.port import FLAT, KIND, FlatPort
+from uwsfm.residuals.border import BORDER_SIZE
+from uwsfm.rig import Rig
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.mapping.growing_map import GrowingMap, Mask
+from uwsfm.sfm.refine import rig_options
+from uwsfm.solver.layout import HELD, build_layout
+from uwsfm.solver.levenberg_marquardt import LevenbergMarquardtOptions, minimize
+from uwsfm.solver.state import State
+
+MIN_LOSS_SCALE_PX = 1.0
+"""Cauchy's c is the median error, but not below this."""
+NORMAL_STDDEV_DEG = 10.0
+"""Of the start's normals: much weaker than what ten frames tell."""
+MIN_STDDEV_M = 0.01
+"""Of the start's port distances; they are good to themselves, or to this."""
+GLOBAL_ITERATIONS = 20
+LOCAL_ITERATIONS = 8
+MIN_RELATIVE_DECREASE = 1e-3
+"""The map changes again anyway; `refine_scene` is there for the last digits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Housings:
+    """What is refined beside poses and points once there are enough frames."""
+
+    settings: CalibrateOptions
+    """With weak priors, which hold what few frames do not determine."""
+    known: Scene
+    """Has the cameras and the rig that the priors are around."""
+
+    @classmethod
+    def of(cls, rig: Rig, growing: GrowingMap) -> Housings | None:
+        """What a rig lets the images refine; None: nothing.
+
+        The baseline is held: what is known of its length matters at the end only. So is
+        the distance of a single camera's port, which scales with everything else, and
+        the centre of a dome.
+        """
+        flat = [c.port for c in rig.cameras if isinstance(c.port, FlatPort)]
+        distance = float(np.mean([port.distance for port in flat])) if flat else 0.0
+        settings = CalibrateOptions.parsed(
+            {
+                **rig_options(rig),
+                **({"refine_distances": False} if len(rig.cameras) == 1 else {}),
+                "refine_centers": False,
+                "baseline_stddev_m": 0.0,
+                "normal_stddev_deg": NORMAL_STDDEV_DEG,
+                "distance_stddev_m": max(distance, MIN_STDDEV_M),
+            }
+        )
+        housings = cls(settings=settings, known=growing.scene()[0])
+        free = housings.columns(np.zeros(len(rig.cameras), dtype=bool)) != HELD
+        return housings if np.any(free) else None
+
+    def columns(self, at_zero: Mask) -> IndexArray:
+        return self.settings.border_columns(self.known.cameras, at_zero)
+
+
+def adjust_locally(growing: GrowingMap, free: IndexArray) -> None:
+    """Move some frames and the points they see; all else is held."""
+    scene, _ = growing.scene()
+    moving = np.isin(scene.frame_idx, free)
+    part, points = scene.select(np.isin(scene.point_idx, scene.point_idx[moving]))
+    held = np.ones(scene.num_frames, dtype=bool)
+    held[free] = False
+    state = _minimized(part, None, held, LOCAL_ITERATIONS)
+    growing.points[points] = state.points
+    growing.place(free, state.rig_from_world)
+
+
+def adjust_globally(growing: GrowingMap, housings: Housings | None) -> None:
+    """Move all frames and points but the first frame; and the housings, if given."""
+    scene, _ = growing.scene()
+    state = _minimized(scene, housings, None, GLOBAL_ITERATIONS)
+    growing.points = state.points
+    growing.rig_from_world = state.rig_from_world
+    moved = state.to_scene(scene)
+    growing.set_cameras(moved.cameras, moved.cam_from_rig)
+
+
+def _minimized(
+    scene: Scene,
+    housings: Housings | None,
+    held_frames: Mask | None,
+    max_iterations: int,
+) -> State:
+    """Robust least squares. No port is behind its camera: it is held at zero then."""
+    options = LevenbergMarquardtOptions(
+        loss="cauchy",
+        loss_scale_px=loss_scale_px(scene),
+        max_iterations=max_iterations,
+        min_relative_decrease=MIN_RELATIVE_DECREASE,
+    )
+    start = State.from_scene(scene)
+    at_zero = np.zeros(len(scene.cameras), dtype=bool)
+    while True:
+        columns = np.full((len(scene.cameras), BORDER_SIZE), HELD, dtype=np.int64)
+        priors = None
+        if housings is not None:
+            columns = housings.columns(at_zero)
+            priors = border_priors(housings.known, housings.settings, columns, 1.0)
+        layout = build_layout(scene, columns, held_frames)
+        state = minimize(layout, start, options, priors).state
+        negative = (state.ports[:, KIND] == FLAT) & (state.ports[:, 3] < 0.0)
+        if housings is None or not np.any(negative):
+            return state
+        at_zero |= negative
+        ports = state.ports.copy()
+        ports[at_zero, 3] = 0.0
+        start = replace(state, ports=ports)
+
+
+def loss_scale_px(scene: Scene) -> float:
+    """Where the robust loss sets in: wide while the ports are still guesses."""
+    errors = np.linalg.norm(scene.residuals(), axis=1)
+    return max(float(np.nanmedian(errors)), MIN_LOSS_SCALE_PX)
