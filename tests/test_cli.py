@@ -8,15 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filelock import FileLock
+from sfm_scenes import model_of
 
 from uwsfm.console import console, housing_table
+from uwsfm.export.files import export_colmap
+from uwsfm.export.housing import export_housing
 from uwsfm.pipeline import WORK
+from uwsfm.simulate import ObservationOptions, simulate_scene
+from uwsfm.simulate.rigs import sample_rig
+from uwsfm.simulate.trajectories import rich_motion
 
 COMMANDS = [
     [],
     ["init"],
     ["reconstruct"],
     ["demo"],
+    ["export"],
     ["simulate"],
     ["simulate", "images"],
     ["simulate", "observations"],
@@ -197,6 +204,37 @@ def test_simulate_observations_calibrate_back(tmp_path):
     _one_sentence(
         run("simulate", "images", "-o", "d", "--preset", "ocean", cwd=tmp_path), "ocean"
     )
+
+
+@pytest.mark.parametrize("to", ["pinhole", "refractive-colmap", "ply"])
+def test_export_writes_what_is_asked(tmp_path, to):
+    rig = sample_rig()
+    options = ObservationOptions(num_points=60, noise_px=0.3)
+    scene = simulate_scene(rig, rich_motion(2), None, options).scene
+    export_colmap(model_of(rig, scene), tmp_path / "out" / "sparse")
+    export_housing(rig, tmp_path / "out" / "housing.yaml")
+    found = run("export", "out", "-o", "target", "--to", to, cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert "wrote target" in found.stdout
+    if to == "pinhole":
+        assert "left/0000.jpg" in found.stdout
+    again = run("export", "out", "-o", "target", "--to", to, cwd=tmp_path)
+    _one_sentence(again, "target exists already")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere", "--to", "pinhole"], "nowhere: no such folder"),
+        (["nowhere", "--to", "ply", "--images", "x"], "--to ply writes no images"),
+    ],
+)
+def test_export_names_the_mistake(tmp_path, arguments, words):
+    _one_sentence(run("export", *arguments, "-o", "target", cwd=tmp_path), words)
+    found = run("export", "out", "-o", "target", "--to", "pdf", cwd=tmp_path)
+    assert found.returncode == 2
+    assert "'pdf' is not one of" in " ".join(found.stderr.split())
+    assert not list(tmp_path.iterdir())
 
 
 def test_output_folder_that_is_a_file(tmp_path):

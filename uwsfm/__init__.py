@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from uwsfm.errors import InputError, UwsfmError
     from uwsfm.export.files import export_colmap, export_ply, read_model
     from uwsfm.export.housing import export_housing
+    from uwsfm.export.pinhole_files import export_pinhole
+    from uwsfm.export.refractive_colmap import (
+        export_refractive_colmap,
+        read_refractive_colmap,
+    )
+    from uwsfm.export.scene_ply import export_scene_ply
     from uwsfm.housing_pipeline import calibrate_housing
     from uwsfm.models.port import DomePort, FlatPort, NoPort
     from uwsfm.models.refractive import RefractiveCamera
@@ -57,9 +63,13 @@ _HOMES = {
     "verdicts": "uwsfm.calibration.observability",
     "export_colmap": "uwsfm.export.files",
     "export_housing": "uwsfm.export.housing",
+    "export_pinhole": "uwsfm.export.pinhole_files",
     "export_ply": "uwsfm.export.files",
+    "export_refractive_colmap": "uwsfm.export.refractive_colmap",
+    "export_scene_ply": "uwsfm.export.scene_ply",
     "load_rig": "uwsfm.rig_file",
     "read_model": "uwsfm.export.files",
+    "read_refractive_colmap": "uwsfm.export.refractive_colmap",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
 }
@@ -82,11 +92,15 @@ __all__ = [
     "error_budget",
     "export_colmap",
     "export_housing",
+    "export_pinhole",
     "export_ply",
+    "export_refractive_colmap",
+    "export_scene_ply",
     "load_rig",
     "perspective_adjustment",
     "predict_covariance",
     "read_model",
+    "read_refractive_colmap",
     "reconstruct",
     "refine_model",
     "verdicts",

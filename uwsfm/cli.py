@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from uwsfm.cli_export import export
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ simulate_app = typer.Typer(
     help="Synthetic dives with known truth.", no_args_is_help=True
 )
 app.add_typer(simulate_app, name="simulate")
+app.command()(export)
 
 FAILED, WRONG_INPUT = 1, 2
 

@@ -206,6 +206,33 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
+MAX_IMAGE_ROWS = 40
+
+
+def pinhole_table(report: dict[str, Any]) -> Table:
+    """What refraction is left in each image of a central model, the worst first."""
+    table = Table(
+        title="Refraction left (px), at points that were left out",
+        title_justify="left",
+    )
+    table.add_column("image", no_wrap=True)
+    for column in ("points", "RMS", "max", "one depth: RMS", "max"):
+        table.add_column(column, justify="right")
+    images = sorted(report["images"], key=lambda image: -(image["rms_px"] or 0.0))
+    for image in images[:MAX_IMAGE_ROWS]:
+        cells = [_number(image[key], "{:.3f}") for key in _PINHOLE_COLUMNS]
+        table.add_row(Text(image["name"]), f"{image['num_points']}", *cells)
+    if len(images) > MAX_IMAGE_ROWS:
+        table.add_row(f"and {len(images) - MAX_IMAGE_ROWS} better ones")
+    table.add_section()
+    cells = [_number(report[key], "{:.3f}") for key in _PINHOLE_COLUMNS]
+    table.add_row("all", f"{report['num_observations']}", *cells)
+    return table
+
+
+_PINHOLE_COLUMNS = ("rms_px", "max_px", "constant_rms_px", "constant_max_px")
+
+
 def timings_table(timings: dict[str, float]) -> Table:
     """Where the time went."""
     total = sum(timings.values())

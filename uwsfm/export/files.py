@@ -38,6 +38,18 @@ def read_model(folder: str | Path) -> Model:
     return from_reconstruction(reconstruction, load_rig(folder / HOUSING))
 
 
+def checked_target(path: str | Path) -> Path:
+    """Where an export may be written: never over anything.
+
+    Raises:
+        InputError: there is something already.
+    """
+    target = Path(path)
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError(f"{target} exists already: name another place with --out")
+    return target
+
+
 def export_colmap(model: Model, folder: str | Path) -> None:
     """Write a COLMAP binary model: cameras, rigs, frames, images, points3D."""
     reconstruction = to_reconstruction(model)

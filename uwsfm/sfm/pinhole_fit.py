@@ -18,17 +18,20 @@ from numpy.typing import ArrayLike
 
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
 
 GRID_STEPS = 24
+MAX_SLOPE = 3.73
+"""Against the optical axis, 75 degrees: beyond it no pinhole image is of use."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VirtualPinhole:
     """A pinhole camera in water, with the axes of the real camera.
 
-    Virtual pixels are about as large as true ones: the focal length is that in air
-    times the index of water.
+    Virtual pixels are about as large as true ones: the focal length is that in air,
+    behind a flat port times the index of water.
     """
 
     center_in_cam: Array
@@ -39,7 +42,8 @@ class VirtualPinhole:
     principal_point: tuple[float, float]
     width: int
     height: int
-    """The virtual image holds all of the real one, whose borders bulge."""
+    """The virtual image holds all of the real one, whose borders bulge, up to 75
+    degrees from the optical axis."""
     rms_px: float
     """Error at the 10th and 90th percentile of depth."""
     max_px: float
@@ -82,9 +86,13 @@ def fit_virtual_pinhole(
     """
     xy = _pixel_grid(camera)
     origins, dirs = camera.ray_from_img(xy)
+    within = np.linalg.norm(dirs[:, :2], axis=1) < MAX_SLOPE * dirs[:, 2]
+    xy, origins, dirs = xy[within], origins[within], dirs[within]
     center = triangulate_tracks(origins, dirs, np.zeros(len(xy), dtype=np.int64), 1)[0]
     near, depth, far = (np.inf,) * 3 if depths is None else np.asarray(depths, float)
-    focal = float(camera.port.n_water * np.mean(_focal_lengths(camera)))
+    # A dome around the camera magnifies nothing.
+    magnification = camera.port.n_water if isinstance(camera.port, FlatPort) else 1.0
+    focal = float(magnification * np.mean(_focal_lengths(camera)))
     image = focal * _tangents(camera, xy, center, depth)
     low, high = np.nanmin(image, axis=0), np.nanmax(image, axis=0)
     errors = [

@@ -1,0 +1,60 @@
+"""`uwsfm export`: a reconstruction for other programs."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from uwsfm.errors import InputError
+
+if TYPE_CHECKING:
+    from uwsfm.colmap import Model
+
+
+def export(
+    model: Annotated[
+        Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder or file to write.")],
+    to: Annotated[
+        Literal["pinhole", "refractive-colmap", "ply"],
+        typer.Option(
+            help="pinhole: a central COLMAP model for stock tools, without refraction; "
+            "refractive-colmap: the text format of Refractive COLMAP; "
+            "ply: points, cameras and ports in one file."
+        ),
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="The images that were reconstructed: pinhole warps them by the depth.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write a reconstruction for other programs."""
+    from uwsfm.export.files import read_model
+
+    if images is not None and to != "pinhole":
+        raise InputError(f"--images: --to {to} writes no images")
+    found = read_model(model)
+    if to == "pinhole":
+        _export_pinhole(found, out, images)
+    elif to == "refractive-colmap":
+        from uwsfm.export.refractive_colmap import export_refractive_colmap
+
+        export_refractive_colmap(found, out)
+    else:
+        from uwsfm.export.scene_ply import export_scene_ply
+
+        export_scene_ply(found, out)
+    typer.echo(f"wrote {out}")
+
+
+def _export_pinhole(model: "Model", out: Path, images: Path | None) -> None:
+    from uwsfm.console import ProgressBars, console, pinhole_table
+    from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
+
+    with ProgressBars() as progress:
+        found = export_pinhole(model, out, images, progress)
+    console.print(pinhole_table(pinhole_report(found)))
