@@ -12,6 +12,7 @@ from uwsfm._load_order import refuse_broken_zlib
 if TYPE_CHECKING:
     from uwsfm.calibration.bundle_adjustment import calibrate
     from uwsfm.calibration.error_budget import error_budget
+    from uwsfm.calibration.lengths import Distances, Lengths, Positions
     from uwsfm.calibration.observability import verdicts
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
@@ -46,6 +47,9 @@ _HOMES = {
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
     "DomePort": "uwsfm.models.port",
+    "Distances": "uwsfm.calibration.lengths",
+    "Lengths": "uwsfm.calibration.lengths",
+    "Positions": "uwsfm.calibration.lengths",
     "FlatPort": "uwsfm.models.port",
     "NoPort": "uwsfm.models.port",
     "Model": "uwsfm.colmap",
@@ -77,11 +81,14 @@ _HOMES = {
 __all__ = [
     "CalibrateOptions",
     "CalibrationResult",
+    "Distances",
     "DomePort",
     "FlatPort",
     "InputError",
+    "Lengths",
     "Model",
     "NoPort",
+    "Positions",
     "RefractiveCamera",
     "Rig",
     "Scene",

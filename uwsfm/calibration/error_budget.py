@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.calibration.priors import border_priors
+from uwsfm.calibration.lengths import Lengths
+from uwsfm.calibration.outside import Outside
+from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.calibration.uncertainty import likelihood
 from uwsfm.geometry import unit_vector
@@ -18,10 +20,9 @@ from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver import schur
-from uwsfm.solver.covariance import inverse_of_lower
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import suitable_blas
-from uwsfm.solver.state import State
+from uwsfm.solver.quasidefinite import inverse_of_lower, without_forces
 
 FOCAL, CX, CY = border.FIRST_LENS, border.FIRST_LENS + 2, border.FIRST_LENS + 3
 
@@ -125,13 +126,17 @@ def _propagate(
     num_free = int(columns.max(initial=-1)) + 1
     extended = columns.copy()
     extended[given] = num_free + np.arange(np.count_nonzero(given))
-    layout = build_layout(scene, extended)
-    state = State.from_scene(scene)
+    outside = Outside(scene, Lengths())  # of one camera, a length is taken for known
+    layout = build_layout(scene, extended, num_lengths=outside.num_lengths)
+    state = outside.placed(scene)
     sigma = _sigma(scene, layout.num_frame_cols + num_free)
-    priors = border_priors(scene, settings, columns, sigma)
+    own = border_priors(scene, settings, columns, sigma)
+    used, frames = np.unique(scene.point_idx), np.unique(scene.frame_idx)
+    priors = with_terms(own, outside.terms(used, frames, sigma), state)
     with suitable_blas(layout):
         eqs = likelihood(layout, state, priors)
         lower, _, _ = schur.reduced_system(layout, eqs, 0.0)
+        lower, _, _ = without_forces(lower, layout.num_lengths)
         # The order of the border is that of the columns: the given ones come last.
         split = layout.num_frame_cols + num_free
         coupling = lower[split:, :split]

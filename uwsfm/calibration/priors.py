@@ -1,12 +1,14 @@
 """What the user knows beforehand, as rows of the border."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD
-from uwsfm.solver.levenberg_marquardt import Priors
+from uwsfm.solver.levenberg_marquardt import Priors, Term
 from uwsfm.solver.state import State
 
 _FX, _FY, _CX, _CY = range(border.FIRST_LENS, border.FIRST_LENS + 4)
@@ -43,3 +45,15 @@ def border_priors(
     stddevs[shared, _FY] = np.inf  # one focal length, known once
     weights = np.where(columns != HELD, (sigma_px / stddevs) ** 2, 0.0)
     return Priors(reference=reference, weights=weights) if weights.any() else None
+
+
+def with_terms(
+    own: Priors | None, terms: tuple[Term, ...], reference: State
+) -> Priors | None:
+    """Priors of the border, if any, and terms, if any."""
+    if not terms:
+        return own
+    if own is None:
+        nothing = np.zeros((len(reference.ports), border.BORDER_SIZE))
+        return Priors(reference=reference, weights=nothing, terms=terms)
+    return replace(own, terms=terms)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.lengths import LengthFit, PositionFit
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
@@ -282,6 +283,10 @@ class Covariance:
     determined: bool
     """False: the data leave some direction of the refined parameters free, and every
     standard deviation is NaN."""
+    scale_stddev: float | None
+    """Relative standard deviation of the distance between two frames far apart. None:
+    nothing determines the scale, every length is in an arbitrary unit, and what is said
+    of lengths takes one distance between two frames for known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,3 +326,6 @@ class CalibrationResult:
     covariance: Covariance
     options: CalibrateOptions
     """That were asked for."""
+    lengths: LengthFit | None = None
+    positions: PositionFit | None = None
+    """Then the scene is in the frame of the positions."""

@@ -1,18 +1,22 @@
 """What is known of the estimates at an optimum: covariances and standard deviations."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.priors import border_priors
+from uwsfm.calibration.lengths import Lengths
+from uwsfm.calibration.outside import Outside
+from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
 from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DOME, KIND, DomePort
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.solver import schur
 from uwsfm.solver.clustered import clustered_covariance
 from uwsfm.solver.covariance import (
     ReducedCovariance,
@@ -27,8 +31,9 @@ from uwsfm.solver.levenberg_marquardt import (
     Problem,
     suitable_blas,
 )
-from uwsfm.solver.normal_equations import NormalEquations
+from uwsfm.solver.normal_equations import NormalEquations, empty_normal_equations
 from uwsfm.solver.state import State, translation_arm
+from uwsfm.solver.terms import centers
 
 # Neighbours err together within a quarter of an image. Fewer, larger clusters would
 # number less than the poses they have to tell apart.
@@ -55,16 +60,55 @@ class Optimum:
     image_sizes: IndexArray
     """(C, 2) width, height."""
     degrees_of_freedom: int
+    scale_ends: IndexArray
+    """(2,) two frames far apart."""
+    scale_held: bool
+    """Because nothing determines it."""
 
 
-def posterior_covariance(optimum: Optimum) -> Covariance:
+class Posterior(NamedTuple):
+    covariance: Covariance
+    navigation: Array
+    """(6, 6) of nav_from_world, left tangent; empty if that is not estimated."""
+
+
+def posterior_covariance(optimum: Optimum) -> Posterior:
     """Covariances from the noise found, and standard deviations that neighbours' shared
     errors cannot beat."""
     with suitable_blas(optimum.layout):
         return _posterior_covariance(optimum)
 
 
-def _posterior_covariance(optimum: Optimum) -> Covariance:
+def scale_stddev(optimum: Optimum) -> float:
+    """Relative standard deviation of the scale; infinite if it is open."""
+    with suitable_blas(optimum.layout):
+        eqs = likelihood(optimum.layout, optimum.state, optimum.priors)
+        reduced = reduced_covariance(optimum.layout, eqs)
+    if not reduced.determined:
+        return np.inf
+    return optimum.sigma_px * _scale_stddev(
+        optimum.layout, optimum.state, reduced, optimum.scale_ends
+    )
+
+
+def _scale_stddev(
+    layout: Layout, state: State, reduced: ReducedCovariance, ends: IndexArray
+) -> float:
+    """Relative standard deviation of the distance between two frames, unit noise."""
+    first, second = centers(state.rig_from_world[ends])
+    length = float(np.linalg.norm(first - second))
+    if length == 0.0:
+        return 0.0
+    slope = np.zeros(len(reduced.matrix))
+    for frame, sign in zip(ends, (1.0, -1.0), strict=True):
+        col = int(layout.frame_col[frame])
+        if col != HELD:
+            away = sign * (second - first) / length
+            slope[col + 3 : col + 6] = rigid3.rotate(state.rig_from_world[frame], away)
+    return float(np.sqrt(slope @ reduced.matrix @ slope)) / length
+
+
+def _posterior_covariance(optimum: Optimum) -> Posterior:
     layout = optimum.layout
     eqs = likelihood(layout, optimum.state, optimum.priors)
     reduced = reduced_covariance(layout, eqs)
@@ -84,23 +128,29 @@ def _posterior_covariance(optimum: Optimum) -> Covariance:
         )
         # Sampling noise can make the second one smaller: then the first is the truth.
         cameras.append(_camera_covariance(np.maximum(alone, together), at_zero))
-    return Covariance(
+    scale = _scale_stddev(layout, optimum.state, reduced, optimum.scale_ends)
+    covariance = Covariance(
         border=border,
         border_cols=optimum.columns,
         frames=variance * reduced.frames(layout),
         points=points,
         cameras=tuple(cameras),
         determined=reduced.determined,
+        scale_stddev=None if optimum.scale_held else optimum.sigma_px * scale,
     )
+    return Posterior(covariance, variance * reduced.navigation(layout))
 
 
-def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covariance:
+def predict_covariance(
+    scene: Scene, noise_px: float, *, lengths: Lengths | None = None, **options: Any
+) -> Covariance:
     """What observations like these can tell at best: the Cramer-Rao bound.
 
     Args:
         scene: its values are taken for the truth; only the places of its observations
             matter, not their errors.
         noise_px: standard deviation of every image coordinate, errors independent.
+        lengths: that are known beside the baselines.
         **options: fields of `CalibrateOptions`.
 
     Raises:
@@ -118,10 +168,21 @@ def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covaria
     scene = replace(scene, xy=pixels)
     at_zero = np.zeros(len(scene.cameras), dtype=bool)
     columns = settings.border_columns(scene.cameras, at_zero)
-    layout, state = build_layout(scene, columns), State.from_scene(scene)
-    priors = border_priors(scene, settings, columns, noise_px)
+    outside = Outside(scene, lengths or Lengths())
+    outside.robust = False
+    state = outside.placed(scene)
+    layout = build_layout(
+        scene,
+        columns,
+        navigation=outside.navigation,
+        num_lengths=outside.num_lengths,
+    )
+    used, frames = np.unique(scene.point_idx), np.unique(scene.frame_idx)
+    own = border_priors(scene, settings, columns, noise_px)
+    priors = with_terms(own, outside.terms(used, frames, noise_px), state)
     eqs = likelihood(layout, state, priors)
     reduced = reduced_covariance(layout, eqs)
+    scale = noise_px * _scale_stddev(layout, state, reduced, outside.ends)
     variance = noise_px**2
     border = variance * reduced.border(layout)
     return Covariance(
@@ -138,6 +199,7 @@ def predict_covariance(scene: Scene, noise_px: float, **options: Any) -> Covaria
             )
         ),
         determined=reduced.determined,
+        scale_stddev=None if outside.hold_scale else scale,
     )
 
 
@@ -160,11 +222,27 @@ def _shared_errors(
     # Residuals are smaller than errors by the share of fitted parameters.
     covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
     if optimum.priors is not None:
-        weights = optimum.priors.weights
-        known = (weights > 0.0) & (layout.border_col != HELD)
-        reach = reduced.matrix[offset:, offset + layout.border_col[known]]
-        covariance += optimum.sigma_px**2 * (reach * weights[known]) @ reach.T
-    return covariance
+        known = _prior_information(layout, optimum.state, optimum.priors)
+        reach = reduced.matrix[offset:]
+        covariance += optimum.sigma_px**2 * reach @ known @ reach.T
+    return covariance[: layout.num_camera_cols, : layout.num_camera_cols]
+
+
+def _prior_information(layout: Layout, state: State, priors: Priors) -> Array:
+    """What the priors alone add to the reduced matrix (n, n).
+
+    A length's own variance is the noise of its column.
+    """
+    eqs = empty_normal_equations(layout)
+    priors.add_to(eqs, state, layout)
+    offset, size = layout.num_frame_cols, layout.num_unknowns
+    matrix = np.zeros((offset + layout.num_border_cols,) * 2)
+    right = np.empty(len(matrix))
+    schur.fill_frames_and_border(layout, eqs, 0.0, matrix, right, offset)
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    matrix[size:, :size] = matrix[:size, size:] = 0.0
+    matrix[size:, size:] *= -1.0
+    return matrix
 
 
 def _clusters(optimum: Optimum) -> IndexArray:

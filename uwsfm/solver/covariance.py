@@ -4,17 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver import schur
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import NormalEquations
-
-# A reduced system, scaled to a unit diagonal, whose smallest eigenvalue is below this
-# has a direction that the data leave to rounding errors.
-SINGULAR = 1e-13
+from uwsfm.solver.quasidefinite import inverse_of_lower
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +25,16 @@ class ReducedCovariance:
 
     def border(self, layout: Layout) -> Array:
         """(B, B) block of rig and ports, marginal over poses and points."""
-        offset = layout.num_frame_cols
-        return self.matrix[offset:, offset:]
+        inside = slice(layout.num_frame_cols, None)
+        return self.matrix[inside, inside][: layout.num_camera_cols][
+            :, : layout.num_camera_cols
+        ]
+
+    def navigation(self, layout: Layout) -> Array:
+        """(6, 6) block of nav_from_world [rotation, translation], left tangent."""
+        end = layout.num_unknowns
+        inside = slice(end - layout.num_nav_cols, end)
+        return self.matrix[inside, inside]
 
     def frames(self, layout: Layout) -> Array:
         """(F, 6, 6) blocks of the poses [rotation, translation]; zero if held."""
@@ -47,39 +51,12 @@ def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovarianc
     The observations' noise is taken as 1 px: multiply by the noise variance.
     """
     matrix, _, inverses = schur.reduced_system(layout, eqs, 0.0)
-    inverse = inverse_of_lower(matrix)
+    inverse = inverse_of_lower(matrix, layout.num_lengths)
     if inverse is None:
         return ReducedCovariance(
             matrix=np.full_like(matrix, np.nan), determined=False, inverses=inverses
         )
     return ReducedCovariance(matrix=inverse, determined=True, inverses=inverses)
-
-
-def inverse_of_lower(matrix: Array) -> Array | None:
-    """Inverse of a symmetric matrix by Cholesky; None if it is singular.
-
-    Args:
-        matrix: (n, n), its lower triangle; lost.
-    """
-    if not len(matrix):
-        return matrix
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    matrix *= scale
-    matrix *= scale[:, None]
-    # Fortran reads rows as columns: our lower triangle is its upper one.
-    upper = matrix.T
-    factor, info = lapack.dpotrf(upper, lower=0, clean=1, overwrite_a=1)
-    if info != 0:
-        return None
-    # 1 / |A^-1|, which is at most the smallest eigenvalue.
-    if not lapack.dpocon(factor, 1.0)[0] > SINGULAR:
-        return None
-    inverse, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
-    lower = inverse.T
-    inverse = lower + np.tril(lower, -1).T
-    inverse *= scale
-    inverse *= scale[:, None]
-    return inverse
 
 
 @kernel

@@ -44,20 +44,36 @@ class Layout(NamedTuple):
     """Their columns."""
     free_lens: bool
     """Whether a lens parameter is among them."""
+    num_nav_cols: int
+    """6 if nav_from_world is estimated, else 0: after the cameras' columns."""
+    num_lengths: int
+    """Known lengths, one column each at the end: see `uwsfm.solver.quasidefinite`."""
 
     @property
     def num_frame_cols(self) -> int:
         return 6 * int(np.count_nonzero(self.frame_col != HELD))
 
     @property
-    def num_border_cols(self) -> int:
+    def num_camera_cols(self) -> int:
         return int(self.border_col.max(initial=-1)) + 1
+
+    @property
+    def num_border_cols(self) -> int:
+        return self.num_camera_cols + self.num_nav_cols + self.num_lengths
+
+    @property
+    def num_unknowns(self) -> int:
+        """Of the reduced system; the column of a length is none."""
+        return self.num_frame_cols + self.num_camera_cols + self.num_nav_cols
 
 
 def build_layout(
     scene: Scene,
     border_col: IndexArray,
     held_frames: NDArray[np.bool_] | None = None,
+    *,
+    navigation: bool = False,
+    num_lengths: int = 0,
 ) -> Layout:
     """Sort a scene's observations.
 
@@ -66,6 +82,8 @@ def build_layout(
         border_col: (C, BORDER_SIZE).
         held_frames: (F,) frames that do not move. None: the first observed one, which
             fixes the place of the world.
+        navigation: whether nav_from_world is estimated.
+        num_lengths: how many lengths are known.
 
     Raises:
         InputError: the scene has no observations.
@@ -95,6 +113,8 @@ def build_layout(
         free_slot=np.empty(0, dtype=np.int64),
         free_col=np.empty(0, dtype=np.int64),
         free_lens=False,
+        num_nav_cols=6 if navigation else 0,
+        num_lengths=num_lengths,
     )
     return with_columns(layout, border_col)
 

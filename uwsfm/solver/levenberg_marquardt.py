@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 import numpy as np
-import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 from uwsfm.errors import UwsfmError
@@ -22,6 +22,7 @@ from uwsfm.solver.normal_equations import (
     squared_errors,
     total_cost,
 )
+from uwsfm.solver.quasidefinite import solve_lower
 from uwsfm.solver.state import State
 
 # Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
@@ -48,20 +49,34 @@ class LevenbergMarquardtOptions:
     min_relative_decrease: float = 1e-9
 
 
+class Term(Protocol):
+    """What is known of poses, points and lengths, weighed against a noise in px."""
+
+    def cost(self, state: State) -> float:
+        """px^2"""
+
+    def add_to(self, eqs: NormalEquations, state: State, layout: Layout) -> None:
+        """Add J^T W J and J^T W r; a length writes its column."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Priors:
-    """What is known of the border beforehand: its values, and how well."""
+    """What is known beforehand: values of the border, and how well; and terms."""
 
     reference: State
     weights: Array
     """(C, BORDER_SIZE) (noise of an observation in px / standard deviation) squared;
     zero where nothing is known. A parameter that cameras share has one weight."""
+    terms: tuple[Term, ...] = ()
 
     def cost(self, state: State) -> float:
         miss = state.border_difference(self.reference)
-        return 0.5 * float(np.sum(self.weights * miss**2))
+        own = 0.5 * float(np.sum(self.weights * miss**2))
+        return own + sum(term.cost(state) for term in self.terms)
 
     def add_to(self, eqs: NormalEquations, state: State, layout: Layout) -> None:
+        for term in self.terms:
+            term.add_to(eqs, state, layout)
         miss = state.border_difference(self.reference)
         known = (self.weights > 0.0) & (layout.border_col != HELD)
         cols, weights = layout.border_col[known], self.weights[known]
@@ -131,16 +146,9 @@ class Problem:
     def step(self, eqs: NormalEquations, damping: float) -> tuple[Array, Array] | None:
         """Steps of the reduced system (n,) and the points (P, 3); None if singular."""
         matrix, right, inverses = schur.reduced_system(self.layout, eqs, damping)
-        if len(right) == 0:
-            step = right
-        else:
-            try:
-                factor = scipy.linalg.cho_factor(
-                    matrix, lower=True, overwrite_a=True, check_finite=True
-                )
-            except (scipy.linalg.LinAlgError, ValueError):
-                return None
-            step = scipy.linalg.cho_solve(factor, right)
+        step = solve_lower(matrix, right, self.layout.num_lengths)
+        if step is None:
+            return None
         points_step = np.empty_like(eqs.points_grad)
         offset = self.layout.num_frame_cols
         schur.substitute_back(self.layout, eqs, inverses, step, offset, points_step)
@@ -149,9 +157,14 @@ class Problem:
     def predicted_decrease(
         self, eqs: NormalEquations, damping: float, step: Array, points_step: Array
     ) -> float:
-        """How much the quadratic model falls: 0.5 delta^T (lambda D delta - g)."""
+        """How much the quadratic model falls: 0.5 delta^T (lambda D delta - g).
+
+        A length's column holds its miss r and minus its variance v, and its step is the
+        force (r + J delta) / v: with the miss before, 0.5 r^2 / v, the sum is the same.
+        """
         free = self.layout.frame_col != HELD
         offset = self.layout.num_frame_cols
+        lengths = self.layout.num_unknowns - offset
         diagonals = np.concatenate(
             [
                 np.einsum("faa->fa", eqs.frames[free]).ravel(),
@@ -159,11 +172,14 @@ class Problem:
                 np.einsum("paa->pa", eqs.points).ravel(),
             ]
         )
+        misses = eqs.border_grad[lengths:]
+        before = float(np.sum(misses**2 / -np.einsum("aa->a", eqs.border)[lengths:]))
         grads = [eqs.frames_grad[free].ravel(), eqs.border_grad]
         gradient = np.concatenate([*grads, eqs.points_grad.ravel()])
         delta = np.concatenate([step[:offset], step[offset:], points_step.ravel()])
         scaled = damping * np.maximum(diagonals, MIN_DIAGONAL) * delta
-        return 0.5 * float(delta @ (scaled - gradient))
+        scaled[self.layout.num_unknowns : len(step)] = 0.0
+        return 0.5 * (before + float(delta @ (scaled - gradient)))
 
 
 Report = Callable[[int, float], None]

@@ -33,7 +33,7 @@ def invert_damped(block, damping, inverse):
 
 
 @kernel
-def _fill_frames_and_border(layout, eqs, damping, matrix, right, offset):
+def fill_frames_and_border(layout, eqs, damping, matrix, right, offset):
     """Copy the damped diagonal blocks and the border, before any elimination."""
     num_border = len(eqs.border_grad)
     for f in range(len(layout.frame_col)):
@@ -51,7 +51,9 @@ def _fill_frames_and_border(layout, eqs, damping, matrix, right, offset):
         right[offset + k] = -eqs.border_grad[k]
         for m in range(num_border):
             matrix[offset + k, offset + m] = eqs.border[k, m]
-        matrix[offset + k, offset + k] += damping * max(eqs.border[k, k], MIN_DIAGONAL)
+        if k < num_border - layout.num_lengths:
+            stiff = max(eqs.border[k, k], MIN_DIAGONAL)
+            matrix[offset + k, offset + k] += damping * stiff
 
 
 @kernel
@@ -110,7 +112,7 @@ def eliminate_points(layout, eqs, damping, offset, inverses, matrix, right):
         matrix, right: (n, n) and (n,), written.
     """
     matrix[:], right[:], inverses[:] = 0.0, 0.0, 0.0
-    _fill_frames_and_border(layout, eqs, damping, matrix, right, offset)
+    fill_frames_and_border(layout, eqs, damping, matrix, right, offset)
     folded = np.empty((6, 3))
     swept = np.empty((len(eqs.border_grad), 3))
     for p in range(len(layout.point_start) - 1):

@@ -1,6 +1,6 @@
 """The values a bundle adjustment moves, and how a step moves them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +51,8 @@ class State:
     points: Array
     lenses: Array
     """(C, LENS_SIZE)"""
+    nav_from_world: Array = field(default_factory=lambda: rigid3.IDENTITY)
+    """(7,) where the world is in the frame of the position priors."""
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "State":
@@ -104,6 +106,10 @@ class State:
         offset = layout.num_frame_cols
         frames_step[free] = step[:offset].reshape(-1, 6)
         deltas = spread_border(layout.border_col, step[offset:])
+        nav_step = np.zeros(6)
+        if layout.num_nav_cols:
+            first = offset + layout.num_camera_cols
+            nav_step = step[first : first + layout.num_nav_cols]
         cam_from_rig, ports = self.cam_from_rig.copy(), self.ports.copy()
         for c, delta in enumerate(deltas):
             cam_from_rig[c] = _moved_camera(cam_from_rig[c], delta)
@@ -122,6 +128,7 @@ class State:
             ports=ports,
             points=self.points + points_step,
             lenses=lenses,
+            nav_from_world=rigid3.perturb(self.nav_from_world, nav_step),
         )
 
     def border_difference(self, reference: "State") -> Array:

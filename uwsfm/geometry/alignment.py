@@ -1,0 +1,100 @@
+"""Alignment of matched places: rigid, or with a scale, least squares or robust."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+
+NUM_TRIALS = 1000
+"""Of triples: with half of the places wrong, 125 are right on average."""
+NEAREST = 1e-9
+"""Share that decides, where places on a line leave a turn open: the smallest turn."""
+MEDIAN_CHI2_3 = 2.366
+"""Median of the squared length of a 3-D standard normal vector."""
+LIMIT_CHI2_3 = 16.27
+"""One in a thousand is beyond it."""
+
+
+class Similarity(NamedTuple):
+    """y = scale R x + t."""
+
+    scale: float
+    y_from_x: Array
+    """(7,) rotation, and the translation after scaling."""
+
+    def apply(self, x: Array) -> Array:
+        return rigid3.transform(self.y_from_x, self.scale * x)
+
+
+def align(x: Array, y: Array, weights: Array, *, with_scale: bool) -> Similarity:
+    """Least squares of weights |scale R x + t - y|^2 (Umeyama, PAMI 1991).
+
+    Args:
+        x, y: (N, 3) matched places.
+        weights: (N,), not all zero.
+        with_scale: else the scale is 1.
+    """
+    rotmat, scale, shift = _align(x[None], y[None], weights[None], with_scale)
+    return Similarity(float(scale[0]), rigid3.from_rotmat(rotmat[0], shift[0]))
+
+
+def align_robustly(
+    x: Array, y: Array, covariances: Array, *, with_scale: bool, seed: int = 0
+) -> Similarity:
+    """Alignment that half of the places may contradict.
+
+    The least median of squared misses over their covariances among triples drawn by
+    chance, then least squares on what agrees with it.
+
+    Args:
+        x, y: (N, 3) matched places, at least three.
+        covariances: (N, 3, 3) of y.
+        with_scale: else the scale is 1.
+        seed: of the triples.
+    """
+    rng = np.random.default_rng(seed)
+    triples = np.argsort(rng.random((NUM_TRIALS, len(x))), axis=1)[:, :3]
+    ones = np.ones(triples.shape)
+    rotmat, scale, shift = _align(x[triples], y[triples], ones, with_scale)
+    inverses = np.linalg.inv(covariances)
+    medians = np.empty(NUM_TRIALS)
+    for trial in range(NUM_TRIALS):
+        miss = scale[trial] * x @ rotmat[trial].T + shift[trial] - y
+        medians[trial] = np.median(np.einsum("ni,nij,nj->n", miss, inverses, miss))
+    best = int(np.argmin(medians))
+    found = Similarity(
+        float(scale[best]), rigid3.from_rotmat(rotmat[best], shift[best])
+    )
+    weights = 3.0 / np.trace(covariances, axis1=1, axis2=2)
+    for _ in range(10):
+        miss = found.apply(x) - y
+        squares = np.einsum("ni,nij,nj->n", miss, inverses, miss)
+        limit = LIMIT_CHI2_3 * max(1.0, float(np.median(squares)) / MEDIAN_CHI2_3)
+        near = squares <= limit
+        if np.count_nonzero(near) < 3:
+            break
+        found = align(x, y, near * weights, with_scale=with_scale)
+    return found
+
+
+def _align(
+    x: Array, y: Array, weights: Array, with_scale: bool
+) -> tuple[Array, Array, Array]:
+    """Rotations (T, 3, 3), scales (T,), shifts (T, 3) of T sets (T, N, 3)."""
+    share = weights / weights.sum(axis=1, keepdims=True)
+    x_mean, y_mean = (np.einsum("tn,tni->ti", share, z) for z in (x, y))
+    x_off, y_off = x - x_mean[:, None], y - y_mean[:, None]
+    moment = np.einsum("tn,tni,tnj->tij", share, y_off, x_off)
+    size = np.linalg.norm(moment, axis=(1, 2))[:, None, None]
+    left, values, right = np.linalg.svd(moment + NEAREST * size * np.eye(3))
+    flip = np.ones_like(values)
+    flip[:, 2] = np.sign(np.linalg.det(left @ right))
+    rotmat = (left * flip[:, None]) @ right
+    scale = np.ones(len(x))
+    if with_scale:
+        spread = np.einsum("tn,tni,tni->t", share, x_off, x_off)
+        scale = np.sum(values * flip, axis=1) / np.maximum(spread, 1e-300)
+    shift = y_mean - scale[:, None] * np.einsum("tij,tj->ti", rotmat, x_mean)
+    return rotmat, scale, shift
