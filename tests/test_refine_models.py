@@ -14,6 +14,8 @@ from foreign_models import (
     write,
 )
 from sfm_scenes import model_of
+from test_three_cameras import dive as three_camera_dive
+from test_three_cameras import three_camera_rig
 
 import uwsfm
 from uwsfm.export.files import export_colmap
@@ -74,6 +76,21 @@ def test_self_calibrated_models_end_at_the_refractive_optimum(
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
     assert np.all(model.colors == [10, 20, 30])  # those of the model
     assert np.linalg.norm(model.scene.cam_from_rig[1, 4:]) == pytest.approx(0.2)
+
+
+def test_a_camera_may_never_meet_the_reference(tmp_path):
+    """Three cameras; images of the first and of the third are in different frames, so
+    that the model does not tell where they are to each other: the rig file does."""
+    rig = three_camera_rig()
+    scene = three_camera_dive(noise_px=0.3).scene
+    model = model_of(nominal_rig(rig), scene)
+    absent = {(2 if f % 2 else 0, f) for f in range(scene.num_frames)}
+    found = self_calibrated(model, without=lambda c, f: (c, f) in absent)
+    write(moved(found, 4.0), tmp_path / "model", old=True)
+    result = uwsfm.refine_model(tmp_path / "model", model.rig, tmp_path / "out")
+    assert result.summary["colmap_model"]["num_frames_with_both"] == [4, 0]
+    assert result.summary["num_registered_frames"] == scene.num_frames
+    assert_ports(result, [item.port for item in rig.cameras], sigmas=4.0)
 
 
 def test_what_a_start_is_too_far_off_for_comes_back(tmp_path):
@@ -166,6 +183,6 @@ def test_the_command_line_refines_a_model(dive, tmp_path, capsys, monkeypatch):
         cli.main()
     assert ended.value.code in (0, None)
     shown = capsys.readouterr().out
-    assert "mean error of the COLMAP model" in shown and "water index" in shown
+    assert "of the COLMAP model, same" in shown and "water index" in shown
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["refined"][0]["name"] == "water index"

@@ -227,6 +227,10 @@ def refine(
         Path | None,
         typer.Option(help="Folder of the cameras' folders, for the points' colours."),
     ] = None,
+    database: Annotated[
+        Path | None,
+        typer.Option(help="COLMAP's database: more matches, frames that it lost."),
+    ] = None,
     also: RefineOption = None,
     prior: PriorOption = None,
 ) -> None:
@@ -244,6 +248,7 @@ def refine(
             rig,
             out,
             images=images,
+            database=database,
             progress=progress,
             **_wanted(also or ()),
             **_priors(prior or ()),

@@ -116,9 +116,13 @@ def result_table(summary: dict[str, Any]) -> Table:
     table.add_row("true reprojection RMS before", f"{rms['before']:.3f} px")
     table.add_row("true reprojection RMS after", f"{rms['after']:.3f} px")
     if "colmap_model" in summary:
-        own = summary["colmap_model"]["mean_error_of_kept_px"]
-        table.add_row("mean error", f"{summary['reprojection_mean_px']:.3f} px")
-        table.add_row("mean error of the COLMAP model, same points", f"{own:.3f} px")
+        found = summary["colmap_model"]
+        own, ours = (
+            found[key]
+            for key in ("mean_error_of_common_px", "refractive_error_of_common_px")
+        )
+        table.add_row("mean error", f"{ours:.3f} px")
+        table.add_row("of the COLMAP model, same observations", f"{own:.3f} px")
     _add_refined(table, summary.get("refined", ()))
     return table
 

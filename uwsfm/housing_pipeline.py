@@ -133,7 +133,7 @@ class _Job:
         if self.start == "pairs":
             calibration = self._from_pairs()
         else:
-            scene = self._from_images() if model is None else model.scene
+            scene = self._from_images() if model is None else model.tracks.scene
             if self.start == "paper":
                 scene, _ = perspective_adjustment(scene, loss="cauchy")
             options = dict(self.options)

@@ -1,6 +1,7 @@
 """A COLMAP model that others made, and a rig, in; the refractive model out."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,10 +33,16 @@ from uwsfm.housing_pipeline import refined_rig, require_effect
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import checked_rig, housing_warnings, locked, output_folder
 from uwsfm.rig import Rig
+from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
 from uwsfm.sfm.colors import point_colors
 from uwsfm.sfm.images import image_fault
-from uwsfm.sfm.model_start import ModelStart, start_from_model
+from uwsfm.sfm.model_database import (
+    ImageDatabase,
+    read_image_database,
+    with_database,
+)
+from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
@@ -58,9 +65,10 @@ class RefineResult:
     summary: dict[str, Any]
     """summary.json"""
     start: ModelStart
-    """What the COLMAP model says; ``kept`` rows of its scene are in ``model``."""
-    kept: NDArray[np.int64]
-    """(N,) index in ``start.model`` of each observation of ``model.scene``."""
+    """What the COLMAP model says."""
+    model_idx: NDArray[np.int64]
+    """(N,) index in ``start.model`` of each observation of ``model.scene``; -1 of those
+    that only the database has."""
 
 
 def refine_model(
@@ -69,6 +77,7 @@ def refine_model(
     out: str | Path,
     *,
     images: str | Path | None = None,
+    database: str | Path | None = None,
     progress: Progress = silent,
     **options: Any,
 ) -> RefineResult:
@@ -86,7 +95,10 @@ def refine_model(
         out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply`` and
             ``summary.json``, each replaced as a whole.
         images: Folder that holds one folder of images per camera, to colour the points;
-            without it they keep the colours of the model.
+            without it they keep the colours of the model, and what only the database
+            has is black.
+        database: COLMAP's database of the model: tracks are made again from all its
+            matches, and frames that the model lacks are registered. It is not changed.
         progress: Called with each long step.
         **options: Fields of `CalibrateOptions`.
 
@@ -107,10 +119,15 @@ def refine_model(
         )
     clock = time.perf_counter()
     start = start_from_model(found, rig)
-    paths = None if images is None else _image_paths(Path(images), rig, start)
+    images = None if images is None else Path(images)
+    if images is not None:
+        _check_images(images, rig, start)
+    known = None
+    if database is not None:
+        known = read_image_database(Path(database), start.model, rig)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out):
-        job = _Job(rig, start, paths, out, progress, timings)
+        job = _Job(rig, start, known, images, out, progress, timings)
         return job.run(options)
 
 
@@ -131,19 +148,22 @@ def _same_or_inside(folder: Path, parent: Path) -> bool:
     return folder.resolve().is_relative_to(parent.resolve())
 
 
-def _image_paths(images: Path, rig: Rig, start: ModelStart) -> list[list[Path]]:
-    """[camera][frame]; those in the model are there, the first of each camera fits."""
-    names, registered = start.model.frame_names, start.model.registered
-    paths = [[images / camera.images / n for n in names] for camera in rig.cameras]
+def _image_paths(images: Path, rig: Rig, names: Sequence[str]) -> list[list[Path]]:
+    """[camera][frame]"""
+    return [[images / camera.images / n for n in names] for camera in rig.cameras]
+
+
+def _check_images(images: Path, rig: Rig, start: ModelStart) -> None:
+    """The images of the model are there, and the first of each camera has its size."""
+    paths = _image_paths(images, rig, start.model.frame_names)
     for c, item in enumerate(rig.cameras):
-        there = [paths[c][f] for f in np.flatnonzero(registered[c])]
+        there = [paths[c][f] for f in np.flatnonzero(start.model.registered[c])]
         for path in there:
             if not path.is_file():
                 raise InputError(f"image {path} of the model does not exist")
         fault = image_fault(there[0], (item.camera.width, item.camera.height))
         if fault is not None:
             raise InputError(fault)
-    return paths
 
 
 @dataclass(frozen=True)
@@ -152,37 +172,47 @@ class _Job:
 
     rig: Rig
     start: ModelStart
-    paths: list[list[Path]] | None
+    database: ImageDatabase | None
+    images: Path | None
     out: Path
     progress: Progress
     timings: dict[str, float]
 
     def run(self, options: dict[str, Any]) -> RefineResult:
         clock = time.perf_counter()
-        refined = refine_scene(self.start.scene, self.rig, self.progress, **options)
-        kept = self.start.kept[refined.kept]
-        self._require_raw(refined, kept)
+        tracks = self.start.tracks
+        refined = refine_scene(tracks.scene, self.rig, self.progress, **options)
+        self._require_raw(refined)
+        if self.database is not None:
+            known = tracks.scene
+            tracks = with_database(
+                self.database, refined, tracks.frame_names, self.progress
+            )
+            refined = refine_scene(
+                tracks.scene, self.rig, self.progress, known=known, **options
+            )
         self.timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
-        refined, frames = _without_empty_frames(refined)
-        model = self._model(refined, frames, kept)
+        model_idx = tracks.model_idx[refined.kept]
+        model, refined = self._model(refined, tracks)
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, refined.calibration)
         export_ply(model, self.out / POINTS, refined.calibration.covariance.points)
         self.timings["colours and export"] = time.perf_counter() - clock
-        summary = self._summary(model, refined, kept)
+        summary = self._summary(model, refined, model_idx, tracks.frame_names)
         write_json(summary, self.out / SUMMARY)
         return RefineResult(
             model=model,
             calibration=refined.calibration,
             summary=summary,
             start=self.start,
-            kept=kept,
+            model_idx=model_idx,
         )
 
-    def _require_raw(self, refined: Refined, kept: NDArray[np.int64]) -> None:
+    def _require_raw(self, refined: Refined) -> None:
         """Refuse pixels that only a pinhole fits: those of undistorted images."""
         found = self.start.model
+        kept = self.start.tracks.model_idx[refined.kept]
         own = float(np.nanmean(found.own_error_px[kept]))
         error = errors_summary(refined.calibration)["reprojection_mean_px"]
         if found.lens_models <= CENTRAL and error > CLEARLY_WORSE * own:
@@ -199,41 +229,59 @@ class _Job:
                     "model the raw ones, and is the lens that of the air?"
                 )
 
-    def _model(
-        self, refined: Refined, frames: NDArray[np.int64], kept: NDArray[np.int64]
-    ) -> Model:
-        found, scene = self.start.model, refined.scene
-        if self.paths is None:
-            colors = np.zeros((scene.num_points, 3), dtype=np.uint8)
-            colors[scene.point_idx] = found.colors[found.point_idx[kept]]
-        else:
-            paths = [[of_camera[f] for f in frames] for of_camera in self.paths]
-            colors = point_colors(scene, paths, self.progress)
+    def _model(self, refined: Refined, tracks: Tracks) -> tuple[Model, Refined]:
+        """The result and its calibration, without frames that nothing is left of."""
+        kept, all_frames = refined.kept, refined.scene.frame_idx
+        refined, frames = _without_empty_frames(refined)
+        names = tuple(tracks.frame_names[f] for f in frames)
+        seen = set(zip(refined.scene.camera_idx, all_frames, strict=True))
+        none = np.empty((0, 2))
         return Model(
-            rig=refined_rig(self.rig, scene),
-            scene=scene,
-            frame_names=tuple(found.frame_names[f] for f in frames),
+            rig=refined_rig(self.rig, refined.scene),
+            scene=refined.scene,
+            frame_names=names,
             keypoints=tuple(
-                tuple(of_camera[f] for f in frames) for of_camera in found.keypoints
+                tuple(of_camera[f] if (c, f) in seen else none for f in frames)
+                for c, of_camera in enumerate(tracks.keypoints)
             ),
-            keypoint_idx=found.keypoint_idx[kept],
-            colors=colors,
-        )
+            keypoint_idx=tracks.keypoint_idx[kept],
+            colors=self._colors(refined.scene, names, tracks.model_idx[kept]),
+        ), refined
+
+    def _colors(
+        self, scene: Scene, names: Sequence[str], model_idx: NDArray[np.int64]
+    ) -> NDArray[np.uint8]:
+        """RGB (P, 3) from the images, or else from the model."""
+        if self.images is not None:
+            paths = _image_paths(self.images, self.rig, names)
+            return point_colors(scene, paths, self.progress)
+        found = self.start.model
+        colors = np.zeros((scene.num_points, 3), dtype=np.uint8)
+        there = model_idx >= 0
+        points = found.point_idx[model_idx[there]]
+        colors[scene.point_idx[there]] = found.colors[points]
+        return colors
 
     def _summary(
-        self, model: Model, refined: Refined, kept: NDArray[np.int64]
+        self,
+        model: Model,
+        refined: Refined,
+        model_idx: NDArray[np.int64],
+        names: Sequence[str],
     ) -> dict[str, Any]:
         found = errors_summary(refined.calibration)
         after = found.pop("reprojection_rms_px")
-        names = self.start.model.frame_names
         unregistered = [name for name in names if name not in set(model.frame_names)]
         notes = list(self.start.warnings)
         if unregistered:
             notes.append(
-                f"{len(unregistered)} of {len(names)} frames of the model are not in "
-                f"the result: {', '.join(unregistered[:10])}"
+                f"{len(unregistered)} of {len(names)} frames are not in the result: "
+                f"{', '.join(unregistered[:10])}"
+                f"{' ...' if len(unregistered) > 10 else ''}"
             )
-        own = self.start.model.own_error_px[kept]
+        both = model_idx >= 0
+        own = self.start.model.own_error_px[model_idx[both]]
+        error = model.errors_px()[both]
         return {
             "num_frames": len(names),
             "unregistered_frames": unregistered,
@@ -245,7 +293,9 @@ class _Job:
             "baseline_stddev_m": model.rig.baseline_stddev_m,
             "colmap_model": {
                 **self.start.summary,
-                "mean_error_of_kept_px": float(np.nanmean(own)),
+                "num_common_observations": int(np.count_nonzero(both)),
+                "mean_error_of_common_px": float(np.nanmean(own)),
+                "refractive_error_of_common_px": float(np.nanmean(error)),
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
             "timings_s": self.timings,

@@ -60,17 +60,23 @@ class ModelRig:
     summary: dict[str, Any] = field(default_factory=dict)
 
 
-def rig_of_model(model: ImageModel, rig: Rig) -> ModelRig:
+def rig_of_model(
+    model: ImageModel, rig: Rig, scene_distance_m: float = 1.0
+) -> ModelRig:
     """Average the relative poses of a model, check them, and give them a scale.
 
     Args:
         model: Its poses.
         rig: Its poses are checked; a baseline alone is completed from the model.
+        scene_distance_m: Median depth that the points of a single camera are put at,
+            which has no baseline.
 
     Raises:
         InputError: relative poses that scatter, a rig file that contradicts them, or no
             frame that tells the scale; says what to change.
     """
+    if len(rig.cameras) == 1:
+        return _single_camera(model, scene_distance_m)
     found = [_Pairs.of(model, rig, camera) for camera in range(1, len(rig.cameras))]
     for pairs in found:
         pairs.require_rigid(model, rig)
@@ -94,6 +100,23 @@ def rig_of_model(model: ImageModel, rig: Rig) -> ModelRig:
             "rig_spread_deg": [pairs.spread_deg for pairs in found],
             "rig_spread_of_baseline": [pairs.spread for pairs in found],
         },
+    )
+
+
+def _single_camera(model: ImageModel, scene_distance_m: float) -> ModelRig:
+    in_cam = rigid3.transform(
+        model.cam_from_world[0, model.frame_idx], model.points[model.point_idx]
+    )
+    depth = float(np.nanmedian(in_cam[:, 2]))
+    if not depth > 0.0:
+        raise InputError(f"{model.folder}: most points lie behind the camera")
+    scale = scene_distance_m / depth
+    return ModelRig(
+        cam_from_rig=rigid3.IDENTITY[None],
+        in_model=rigid3.IDENTITY[None],
+        scale=scale,
+        doubtful=np.zeros(model.registered.shape, dtype=bool),
+        summary={"scale_m": scale, "scene_distance_m": scene_distance_m},
     )
 
 

@@ -24,27 +24,48 @@ pixels off."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Tracks:
+    """A scene to adjust, and where its observations come from."""
+
+    scene: Scene
+    frame_names: tuple[str, ...]
+    """(F,)"""
+    keypoints: tuple[tuple[Array, ...], ...]
+    """[camera][frame] -> (n, 2) all keypoints of an image; none if it is not there."""
+    keypoint_idx: IndexArray
+    """(N,) which keypoint of its image each observation is."""
+    model_idx: IndexArray
+    """(N,) index of each observation in the `ImageModel`; -1: it is not from there."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ModelStart:
     """Where a COLMAP model lets the refractive adjustment start from."""
 
     model: ImageModel
     rig: ModelRig
-    scene: Scene
-    """Metres; its frames are those of ``model``, its points as well: a pinhole's."""
-    kept: IndexArray
-    """(N,) index of each observation of ``scene`` in ``model``."""
+    tracks: Tracks
+    """Frames and points are those of ``model``, in metres: a pinhole's."""
     warnings: tuple[str, ...]
     summary: dict[str, Any]
 
 
-def start_from_model(found: FoundModel, rig: Rig) -> ModelStart:
+def start_from_model(
+    found: FoundModel, rig: Rig, scene_distance_m: float = 1.0
+) -> ModelStart:
     """Read a COLMAP model, check it against a rig, and put it into metres.
+
+    Args:
+        found: The model.
+        rig: Lenses in air, initial ports, and the baseline that gives the scale.
+        scene_distance_m: Of the scene of a single camera, about; it sets the scale to
+            start with.
 
     Raises:
         InputError: as `read_image_model` and `rig_of_model`.
     """
     model = read_image_model(found, rig)
-    agreed = rig_of_model(model, rig)
+    agreed = rig_of_model(model, rig, scene_distance_m)
     scene = Scene.from_arrays(
         cameras=rig.refractive_cameras(),
         cam_from_rig=agreed.cam_from_rig,
@@ -71,8 +92,13 @@ def start_from_model(found: FoundModel, rig: Rig) -> ModelStart:
     return ModelStart(
         model=model,
         rig=agreed,
-        scene=_with_observations(scene, kept),
-        kept=kept,
+        tracks=Tracks(
+            scene=_with_observations(scene, kept),
+            frame_names=model.frame_names,
+            keypoints=model.keypoints,
+            keypoint_idx=model.keypoint_idx[kept],
+            model_idx=kept,
+        ),
         warnings=tuple(warnings),
         summary={
             "path": str(found.folder),

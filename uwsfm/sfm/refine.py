@@ -49,7 +49,12 @@ def rig_options(rig: Rig) -> dict[str, Any]:
 
 
 def refine_scene(
-    scene: Scene, rig: Rig, progress: Progress = silent, **options: Any
+    scene: Scene,
+    rig: Rig,
+    progress: Progress = silent,
+    *,
+    known: Scene | None = None,
+    **options: Any,
 ) -> Refined:
     """Refractive bundle adjustment, twice: the second with all tracks tested again.
 
@@ -61,6 +66,7 @@ def refine_scene(
             perspective start; its points are not used.
         rig: what to refine, and how well the baseline is known.
         progress: called as the solver iterates.
+        known: has the cameras and the rig that priors are around; default: ``scene``.
         **options: further fields of `CalibrateOptions`.
 
     Raises:
@@ -77,9 +83,9 @@ def refine_scene(
     calibrated = within_valid_radius(scene, rig)
     scene = retriangulated(scene, calibrated)
     keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
-    start = scene
+    start, known = scene, known or scene
     part, _ = scene.select(_require(keep, scene))
-    first = calibrate(part, report=report, **options)
+    first = calibrate(part, known=known, report=report, **options)
     trusted = np.zeros_like(keep)
     trusted[np.nonzero(keep)[0][first.inliers]] = True
     # Points that the start was too far off for get another chance, as a whole.
@@ -88,7 +94,7 @@ def refine_scene(
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     part, _ = scene.select(_require(keep, scene))
-    second = calibrate(part, known=start, report=report, **options)
+    second = calibrate(part, known=known, report=report, **options)
     kept = np.nonzero(keep)[0][second.inliers]
     final, still = second.scene.select(second.inliers)
     before = start.residuals()[kept]

@@ -24,6 +24,8 @@ NORMAL_STDDEV_DEG = 10.0
 """Of the start's normals: much weaker than what ten frames tell."""
 MIN_STDDEV_M = 0.01
 """Of the start's port distances; they are good to themselves, or to this."""
+LOCAL_FRAMES = 6
+"""Adjusted with a new one."""
 GLOBAL_ITERATIONS = 20
 LOCAL_ITERATIONS = 8
 MIN_RELATIVE_DECREASE = 1e-3
@@ -65,6 +67,20 @@ class Housings:
 
     def columns(self, at_zero: Mask) -> IndexArray:
         return self.settings.border_columns(self.known.cameras, at_zero)
+
+
+def neighbours(growing: GrowingMap, frame: int) -> IndexArray:
+    """A frame and those that share most points with it, without the first of all,
+    which holds the place of the world."""
+    scene, _ = growing.scene()
+    shared = np.zeros(scene.num_points, dtype=bool)
+    shared[scene.point_idx[scene.frame_idx == frame]] = True
+    counts = np.bincount(
+        scene.frame_idx[shared[scene.point_idx]], minlength=scene.num_frames
+    )
+    counts[np.flatnonzero(growing.registered)[0]] = 0
+    order = np.argsort(-counts, kind="stable")[: LOCAL_FRAMES + 1]
+    return np.union1d(order[counts[order] > 0], [frame])
 
 
 def adjust_locally(growing: GrowingMap, free: IndexArray) -> None:

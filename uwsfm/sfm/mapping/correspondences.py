@@ -126,7 +126,7 @@ def read_correspondences(
         ):
             a, b = (image_of(i) for i in pycolmap.pair_id_to_image_pair(pair_id))
             pairs.append(first[[a, b]] + matches.astype(np.int64))
-            flags.append(_in_rows(matches, good.get(pair_id, matches[:0])))
+            flags.append(in_rows(matches, good.get(pair_id, matches[:0])))
     xy, image = np.concatenate(rows), np.repeat(np.arange(len(rows)), counts)
     radii = [item.valid_radius_px for item in rig.cameras]
     limits = np.array([np.inf if radius is None else radius for radius in radii])
@@ -146,7 +146,7 @@ def read_correspondences(
     )
 
 
-def _in_rows(matches: NDArray[np.uint32], some: NDArray[np.uint32]) -> NDArray:
+def in_rows(matches: NDArray[np.uint32], some: NDArray[np.uint32]) -> NDArray:
     """Mask (m,) of the rows of ``matches`` (m, 2) that are in ``some``."""
     keys, known = (
         rows.reshape(-1, 2).astype(np.int64) @ [1 << 32, 1] for rows in (matches, some)

@@ -18,11 +18,15 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
-from uwsfm.scene import IndexArray
-from uwsfm.sfm.mapping.adjustment import Housings, adjust_globally, adjust_locally
+from uwsfm.sfm.mapping.adjustment import (
+    Housings,
+    adjust_globally,
+    adjust_locally,
+    neighbours,
+)
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
-from uwsfm.sfm.mapping.registration import find_pose, ranked_frames
+from uwsfm.sfm.mapping.registration import register_next
 from uwsfm.sfm.options import StartOptions
 
 MIN_SEED_POINTS = 30
@@ -36,8 +40,6 @@ MIN_ERROR_PX = 4.0
 MAX_ERROR_PX = 30.0
 MIN_IMAGES = 3
 """That see a point of the finished map."""
-LOCAL_FRAMES = 6
-"""Adjusted with a new one."""
 GROWTH = 1.25
 """Everything is adjusted when there are so many times more frames than last time."""
 
@@ -164,7 +166,7 @@ class _Grower:
         last_global = 1
         while True:
             self.progress("mapping", growing.num_registered, total)
-            added = self._register_next()
+            added = register_next(growing, self.max_error_px, self.seed)
             count = growing.num_registered
             if added is None:
                 if count < total and count > last_global:
@@ -181,41 +183,8 @@ class _Grower:
                 self._adjust_all(rounds=1)
                 last_global = count
             else:
-                adjust_locally(growing, self._neighbours(added))
+                adjust_locally(growing, neighbours(growing, added))
                 growing.filter(self.max_error_px)
-
-    def _register_next(self) -> int | None:
-        """Add the best frame that fits, and its points: by what pinholes verified, or
-        else by any match."""
-        growing = self.map
-        for verified in (True, False):
-            keypoints, points = growing.visible(verified)
-            frame_of = growing.correspondences.frame[keypoints]
-            for frame in ranked_frames(growing, keypoints, points).tolist():
-                rows = frame_of == frame
-                pose = find_pose(
-                    growing, keypoints[rows], points[rows], self.max_error_px, self.seed
-                )
-                if pose is not None:
-                    poses = growing.rig_from_world.copy()
-                    poses[frame] = pose
-                    growing.place(np.array([frame]), poses)
-                    growing.extend(frame, self.max_error_px)
-                    return frame
-        return None
-
-    def _neighbours(self, frame: int) -> IndexArray:
-        """A frame and those that share most points with it, without the first of all,
-        which holds the place of the world."""
-        scene, _ = self.map.scene()
-        shared = np.zeros(scene.num_points, dtype=bool)
-        shared[scene.point_idx[scene.frame_idx == frame]] = True
-        counts = np.bincount(
-            scene.frame_idx[shared[scene.point_idx]], minlength=scene.num_frames
-        )
-        counts[np.flatnonzero(self.map.registered)[0]] = 0
-        order = np.argsort(-counts, kind="stable")[: LOCAL_FRAMES + 1]
-        return np.union1d(order[counts[order] > 0], [frame])
 
     def _adjust_all(self, rounds: int) -> None:
         growing = self.map

@@ -18,9 +18,12 @@ MAX_TRIALS = 2000
 
 
 def ranked_frames(
-    growing: GrowingMap, keypoints: IndexArray, points: IndexArray
+    growing: GrowingMap,
+    keypoints: IndexArray,
+    points: IndexArray,
+    min_inliers: int = MIN_INLIERS,
 ) -> IndexArray:
-    """Frames that see at least `MIN_INLIERS` points, the best spread ones first.
+    """Frames that see at least ``min_inliers`` points, the best spread ones first.
 
     As in COLMAP, a frame scores the cells of its images that points occupy, on grids
     that become finer; each level weighs its number of cells.
@@ -29,6 +32,7 @@ def ranked_frames(
         growing: The map.
         keypoints: (n,) of frames that are not registered.
         points: (n,) that they match.
+        min_inliers: What a pose will need.
     """
     of = growing.correspondences
     sizes = np.array([(c.width, c.height) for c in growing.cameras], dtype=np.float64)
@@ -40,7 +44,7 @@ def ranked_frames(
         frame = occupied // cells**2 // of.num_cameras
         score += cells**2 * np.bincount(frame, minlength=of.num_frames)
     pairs = np.unique(np.column_stack([of.frame[keypoints], points]), axis=0)
-    score[np.bincount(pairs[:, 0], minlength=of.num_frames) < MIN_INLIERS] = 0.0
+    score[np.bincount(pairs[:, 0], minlength=of.num_frames) < min_inliers] = 0.0
     order = np.argsort(-score, kind="stable")
     return order[score[order] > 0.0]
 
@@ -51,6 +55,7 @@ def find_pose(
     points: IndexArray,
     max_error_px: float,
     seed: int,
+    min_inliers: int = MIN_INLIERS,
 ) -> Array | None:
     """Pose (7,) rig_from_world of a frame, or None if no pose fits enough points.
 
@@ -60,6 +65,7 @@ def find_pose(
         points: (n,) that they may see.
         max_error_px: Of an inlier, true pixels.
         seed: Of the samples.
+        min_inliers: Different points that have to agree.
     """
     of = growing.correspondences
     found = estimate_rig_pose(
@@ -75,6 +81,40 @@ def find_pose(
     if found is None:
         return None
     seen = len(np.unique(points[found.inliers]))
-    if seen < max(MIN_INLIERS, MIN_INLIER_SHARE * len(np.unique(points))):
+    if seen < max(min_inliers, MIN_INLIER_SHARE * len(np.unique(points))):
         return None
     return found.rig_from_world
+
+
+def register_next(
+    growing: GrowingMap,
+    max_error_px: float,
+    seed: int,
+    min_inliers: int = MIN_INLIERS,
+) -> int | None:
+    """Add the best frame that fits, and its points: by what pinholes verified, or else
+    by any match.
+
+    Args:
+        growing: The map.
+        max_error_px: Of an inlier, true pixels.
+        seed: Of the samples.
+        min_inliers: As of `find_pose`.
+
+    Returns:
+        The frame; None if no other one fits.
+    """
+    for verified in (True, False):
+        keypoints, points = growing.visible(verified)
+        frame_of = growing.correspondences.frame[keypoints]
+        for frame in ranked_frames(growing, keypoints, points, min_inliers).tolist():
+            rows = frame_of == frame
+            seen = keypoints[rows], points[rows]
+            pose = find_pose(growing, *seen, max_error_px, seed, min_inliers)
+            if pose is not None:
+                poses = growing.rig_from_world.copy()
+                poses[frame] = pose
+                growing.place(np.array([frame]), poses)
+                growing.extend(frame, max_error_px)
+                return frame
+    return None
