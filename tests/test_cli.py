@@ -14,6 +14,7 @@ from uwsfm.console import console, housing_table
 from uwsfm.export.files import export_colmap
 from uwsfm.export.housing import export_housing
 from uwsfm.pipeline import WORK
+from uwsfm.rig_file import load_rig
 from uwsfm.simulate import ObservationOptions, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -218,6 +219,10 @@ def test_export_writes_what_is_asked(tmp_path, to):
     assert "wrote target" in found.stdout
     if to == "pinhole":
         assert "left/0000.jpg" in found.stdout
+    if to == "refractive-colmap":
+        back = run("init", "back.yaml", "--from", "target", cwd=tmp_path)
+        assert "image folders left, right, baseline 0.2 m" in back.stdout
+        assert load_rig(tmp_path / "back.yaml").cameras[0].port == rig.cameras[0].port
     again = run("export", "out", "-o", "target", "--to", to, cwd=tmp_path)
     _one_sentence(again, "target exists already")
 

@@ -1,15 +1,19 @@
 """Refractive COLMAP's text models: what we write, and what its users have."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sfm_scenes import model_of
 
 import uwsfm
 from uwsfm.colmap import Model, to_reconstruction
-from uwsfm.export.refractive_colmap import (
-    export_refractive_colmap,
+from uwsfm.export.refractive_colmap import export_refractive_colmap
+from uwsfm.rig_file import dump_rig
+from uwsfm.sfm.refractive_colmap import (
     read_refractive_cameras,
     read_refractive_colmap,
+    rig_of_refractive_colmap,
 )
 from uwsfm.simulate import ObservationOptions, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
@@ -113,3 +117,45 @@ def test_missing_files_are_named(tmp_path):
     (tmp_path / "cameras.txt").write_text(PUBLISHED)
     with pytest.raises(uwsfm.InputError, match=r"images.txt: no such file"):
         read_refractive_colmap(tmp_path)
+
+
+def test_rig_comes_back_from_a_model(model, tmp_path):
+    """Folders, ports and placement, by way of a rig file."""
+    export_refractive_colmap(model, tmp_path / "out")
+    rig = rig_of_refractive_colmap(tmp_path / "out" / "cameras.txt")
+    dump_rig(rig, tmp_path / "rig.yaml")
+    again = uwsfm.load_rig(tmp_path / "rig.yaml")
+    assert [c.images for c in again.cameras] == [c.images for c in model.rig.cameras]
+    assert [c.port for c in again.cameras] == list(model.scene.ports)
+    np.testing.assert_allclose(
+        np.array(again.cam_from_rig), model.scene.cam_from_rig, atol=1e-12
+    )
+    assert again.baseline_m == pytest.approx(0.2)
+
+
+def test_one_camera_needs_no_images(tmp_path):
+    """And only ratios of indices matter: air of 1.003, as Calibmar writes it."""
+    (tmp_path / "cameras.txt").write_text(
+        "4 PINHOLE 800 600 600 600 400 300 DOMEPORT 0 0.01 0 0.05 0.007 1.003 1.5 1.34"
+    )
+    rig = rig_of_refractive_colmap(tmp_path)
+    (camera,) = rig.cameras
+    assert (camera.name, camera.images, rig.baseline_m) == ("camera4", "camera4", None)
+    assert camera.port.n_air == 1.0
+    theirs = uwsfm.DomePort((0, 0.01, 0), 0.05, 0.007, 1.5, 1.34, 1.003)
+    xy = [[30.0, 40.0], [700.0, 500.0]]
+    ours = uwsfm.RefractiveCamera(camera.camera, camera.port).ray_from_img(xy)
+    expected = uwsfm.RefractiveCamera(camera.camera, theirs).ray_from_img(xy)
+    np.testing.assert_allclose(ours, expected, atol=1e-15)
+
+
+def test_placement_that_nothing_tells_is_refused(model, tmp_path):
+    (tmp_path / "cameras.txt").write_text(PUBLISHED)
+    with pytest.raises(uwsfm.InputError, match="2 cameras, and without images.txt"):
+        rig_of_refractive_colmap(tmp_path)
+    names = tuple(f"{i}.jpg" for i in range(3))
+    export_refractive_colmap(replace(model, frame_names=names), tmp_path / "out")
+    text = (tmp_path / "out" / "images.txt").read_text()
+    (tmp_path / "out" / "images.txt").write_text(text.replace("right/", "right/r"))
+    with pytest.raises(uwsfm.InputError, match="no images of left and right have"):
+        rig_of_refractive_colmap(tmp_path / "out")

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
     from uwsfm.export.files import export_colmap, export_ply, read_model
     from uwsfm.export.housing import export_housing
     from uwsfm.export.pinhole_files import export_pinhole
-    from uwsfm.export.refractive_colmap import (
-        export_refractive_colmap,
-        read_refractive_colmap,
-    )
+    from uwsfm.export.refractive_colmap import export_refractive_colmap
     from uwsfm.export.scene_ply import export_scene_ply
     from uwsfm.housing_pipeline import calibrate_housing
     from uwsfm.models.port import DomePort, FlatPort, NoPort
@@ -36,6 +33,10 @@ if TYPE_CHECKING:
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
+    from uwsfm.sfm.refractive_colmap import (
+        read_refractive_colmap,
+        rig_of_refractive_colmap,
+    )
 
 refuse_broken_zlib()
 
@@ -73,7 +74,8 @@ _HOMES = {
     "export_scene_ply": "uwsfm.export.scene_ply",
     "load_rig": "uwsfm.rig_file",
     "read_model": "uwsfm.export.files",
-    "read_refractive_colmap": "uwsfm.export.refractive_colmap",
+    "read_refractive_colmap": "uwsfm.sfm.refractive_colmap",
+    "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
 }
@@ -110,6 +112,7 @@ __all__ = [
     "read_refractive_colmap",
     "reconstruct",
     "refine_model",
+    "rig_of_refractive_colmap",
     "verdicts",
 ]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from uwsfm.cli_export import export
+from uwsfm.cli_export import export, init_from
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -84,6 +84,15 @@ def _global_options(
 @app.command()
 def init(
     rig_file: Annotated[Path, typer.Argument(help="File to write.")] = Path("rig.yaml"),
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="cameras.txt of Refractive COLMAP, or its text model: lenses, ports "
+            "and placement from there.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a commented rig file to fill in."""
     from uwsfm._files import replaced_file
@@ -91,6 +100,9 @@ def init(
 
     if rig_file.exists():
         raise InputError(f"{rig_file} exists already: name another file")
+    if source is not None:
+        init_from(source, rig_file)
+        return
     with replaced_file(rig_file) as partial:
         partial.write_text(template(), encoding="utf-8")
     typer.echo(f"wrote {rig_file}: fill in your rig, then run uwsfm reconstruct")

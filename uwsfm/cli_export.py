@@ -1,4 +1,4 @@
-"""`uwsfm export`: a reconstruction for other programs."""
+"""What goes to other programs, and what comes from them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -58,3 +58,18 @@ def _export_pinhole(model: "Model", out: Path, images: Path | None) -> None:
     with ProgressBars() as progress:
         found = export_pinhole(model, out, images, progress)
     console.print(pinhole_table(pinhole_report(found)))
+
+
+def init_from(source: Path, rig_file: Path) -> None:
+    """`uwsfm init --from`."""
+    from uwsfm.rig_file import dump_rig
+    from uwsfm.sfm.refractive_colmap import rig_of_refractive_colmap
+
+    rig = rig_of_refractive_colmap(source)
+    header = "The rig of a model of Refractive COLMAP."
+    if rig.baseline_m is not None:
+        header += "\nThe cameras' placement is in the unit of that model: check it."
+    dump_rig(rig, rig_file, header)
+    length = "" if rig.baseline_m is None else f", baseline {rig.baseline_m:g} m"
+    folders = ", ".join(camera.images for camera in rig.cameras)
+    typer.echo(f"wrote {rig_file}: image folders {folders}{length}; check them")
