@@ -243,6 +243,12 @@ def refine(
         Path | None,
         typer.Option(help="COLMAP's database: more matches, frames that it lost."),
     ] = None,
+    scene_distance: Annotated[
+        float,
+        typer.Option(
+            metavar="METRES", help="Of one camera's scene, about: no baseline tells."
+        ),
+    ] = 1.0,
     also: RefineOption = None,
     prior: PriorOption = None,
 ) -> None:
@@ -261,6 +267,7 @@ def refine(
             out,
             images=images,
             database=database,
+            scene_distance_m=scene_distance,
             progress=progress,
             **_wanted(also or ()),
             **_priors(prior or ()),

@@ -78,6 +78,7 @@ def refine_model(
     *,
     images: str | Path | None = None,
     database: str | Path | None = None,
+    scene_distance_m: float = 1.0,
     progress: Progress = silent,
     **options: Any,
 ) -> RefineResult:
@@ -99,6 +100,8 @@ def refine_model(
             has is black.
         database: COLMAP's database of the model: tracks are made again from all its
             matches, and frames that the model lacks are registered. It is not changed.
+        scene_distance_m: Of a single camera's scene, about: without a baseline it sets
+            the scale to start with.
         progress: Called with each long step.
         **options: Fields of `CalibrateOptions`.
 
@@ -110,6 +113,8 @@ def refine_model(
     rig = checked_rig(rig)
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
+    if not 0.0 < scene_distance_m < np.inf:
+        raise InputError(f"scene_distance_m must be positive, got {scene_distance_m}")
     source, out = Path(source), output_folder(out)
     found = _found(source)
     if out.exists() and _same_or_inside(found.folder, out / SPARSE):
@@ -118,7 +123,7 @@ def refine_model(
             "would replace: choose another folder"
         )
     clock = time.perf_counter()
-    start = start_from_model(found, rig)
+    start = start_from_model(found, rig, scene_distance_m)
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images, rig, start)

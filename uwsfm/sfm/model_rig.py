@@ -116,6 +116,10 @@ def _single_camera(model: ImageModel, scene_distance_m: float) -> ModelRig:
         in_model=rigid3.IDENTITY[None],
         scale=scale,
         doubtful=np.zeros(model.registered.shape, dtype=bool),
+        warnings=(
+            f"one camera has no baseline: lengths of the model were multiplied by "
+            f"{scale:.4g}, so that its points are {scene_distance_m:g} m away (median)",
+        ),
         summary={"scale_m": scale, "scene_distance_m": scene_distance_m},
     )
 
