@@ -10,6 +10,7 @@ from sfm_scenes import model_of
 
 from uwsfm.colmap import Model
 from uwsfm.geometry import rigid3
+from uwsfm.sfm.background import quiet_colmap
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
@@ -146,3 +147,39 @@ def write(
         for name in ("rigs", "frames"):
             (folder / f"{name}.{'txt' if text else 'bin'}").unlink()
     return folder
+
+
+def stock_model(
+    images: Path, folder: Path, max_num_features: int = 8192
+) -> pycolmap.Reconstruction:
+    """SIMPLE_RADIAL, a camera per folder, exhaustive: what the GUI does unasked.
+
+    Args:
+        images: Holds the folders left and right.
+        folder: Receives database.db.
+        max_num_features: Per image; the default is COLMAP's.
+    """
+    database, out = folder / "database.db", folder / "models"
+    out.mkdir()
+    names = [
+        f"{side}/{path.name}"
+        for side in ("left", "right")
+        for path in sorted((images / side).iterdir())
+    ]
+    one = {"num_threads": 1}  # more would give another model each time
+    extraction = pycolmap.FeatureExtractionOptions(one)
+    extraction.sift.max_num_features = max_num_features
+    with quiet_colmap():
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.PER_FOLDER,
+            extraction_options=extraction,
+        )
+        pycolmap.match_exhaustive(
+            database, matching_options=pycolmap.FeatureMatchingOptions(one)
+        )
+        options = pycolmap.IncrementalPipelineOptions({**one, "random_seed": 0})
+        models = pycolmap.incremental_mapping(database, images, out, options)
+    return max(models.values(), key=lambda model: model.num_reg_images())

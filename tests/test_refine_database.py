@@ -10,7 +10,10 @@ from foreign_models import NUM_FRAMES, Dive, self_calibrated, simulated_dive, wr
 
 import uwsfm
 from uwsfm.geometry import unit_vector
+from uwsfm.rig import Rig
 from uwsfm.sfm.background import opened
+from uwsfm.sfm.colmap_model import FoundModel, read_image_model
+from uwsfm.sfm.model_database import read_image_database
 
 LOST = {(0, 3), (1, 3), (0, 8), (1, 8), (1, 5)}
 """(camera, frame) of images that the model has not registered."""
@@ -21,7 +24,9 @@ def dive() -> Dive:
     return simulated_dive()
 
 
-def write_database(path: Path, model, *, wrong: float, shift: float = 0.0) -> Path:
+def write_database(
+    path: Path, model, *, wrong: float, shift: float = 0.0, folders=("left/", "right/")
+) -> Path:
     """Keypoints, raw matches, and as verified those of frames near each other."""
     scene, rng = model.scene, np.random.default_rng(0)
     keypoint_of = {}
@@ -34,7 +39,7 @@ def write_database(path: Path, model, *, wrong: float, shift: float = 0.0) -> Pa
                     c + 1, "SIMPLE_RADIAL", 800.0, *size
                 )
                 database.write_camera(lens, use_camera_id=True)
-            name = model.image_name(c, f)
+            name = folders[c] + model.frame_names[f]
             image = pycolmap.Image(name=name, camera_id=c + 1, image_id=image_id)
             database.write_image(image, use_image_id=True)
             xy = (model.keypoints[c][f] + shift).astype(np.float32)
@@ -82,6 +87,22 @@ def test_lost_frames_and_images_are_registered_from_all_matches(dive, tmp_path):
     np.testing.assert_allclose(  # single precision
         result.start.model.xy[result.model_idx[common]], scene.xy[common], atol=1e-4
     )
+
+
+def test_a_single_cameras_database_need_not_name_the_folder(dive, tmp_path):
+    """The model and the database of COLMAP that was run inside the folder."""
+    rig = Rig(cameras=dive.rig.cameras[:1], cam_from_rig=None, baseline_m=None)
+    found = self_calibrated(dive.model, without=lambda c, f: c == 1)
+    for image in found.images.values():
+        image.name = image.name.removeprefix("left/")
+    write(found, tmp_path / "model", old=True)
+    path = write_database(
+        tmp_path / "database.db", dive.model, wrong=0.0, folders=("", "elsewhere/")
+    )
+    model = read_image_model(FoundModel(folder=tmp_path / "model"), rig)
+    known = read_image_database(path, model, rig)
+    assert known.frame_names[:NUM_FRAMES] == dive.model.frame_names
+    assert np.count_nonzero(known.model_idx >= 0) == len(model.xy)
 
 
 @pytest.mark.parametrize("what", ["other features", "no database", "missing"])

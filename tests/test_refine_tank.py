@@ -8,12 +8,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
-from foreign_models import write
+from foreign_models import stock_model, write
 
 import uwsfm
-from uwsfm.sfm.background import quiet_colmap
 
 ROOT = Path(__file__).parent.parent
 DATA = Path(os.environ.get("UWSFM_DATA", ROOT.parent / "shared" / "data")) / "uril_tank"
@@ -24,32 +22,6 @@ pytestmark = [
         not DATA.is_dir(), reason=f"no images in {DATA}; set UWSFM_DATA"
     ),
 ]
-
-
-def stock_model(folder: Path) -> pycolmap.Reconstruction:
-    """SIMPLE_RADIAL, a camera per folder, exhaustive: what the GUI does unasked."""
-    database, out = folder / "database.db", folder / "models"
-    out.mkdir()
-    names = [
-        f"{side}/{path.name}"
-        for side in ("left", "right")
-        for path in sorted((DATA / side).glob("*.png"))
-    ]
-    one = {"num_threads": 1}  # more would give another model each time
-    with quiet_colmap():
-        pycolmap.extract_features(
-            database,
-            DATA,
-            image_names=names,
-            camera_mode=pycolmap.CameraMode.PER_FOLDER,
-            extraction_options=pycolmap.FeatureExtractionOptions(one),
-        )
-        pycolmap.match_exhaustive(
-            database, matching_options=pycolmap.FeatureMatchingOptions(one)
-        )
-        options = pycolmap.IncrementalPipelineOptions({**one, "random_seed": 0})
-        models = pycolmap.incremental_mapping(database, DATA, out, options)
-    return max(models.values(), key=lambda model: model.num_reg_images())
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +36,7 @@ def study(tmp_path_factory):
         sys.path.pop(0)
     folder = tmp_path_factory.mktemp("tank")
     write_rig(DATA, folder / "rig.yaml", whole_image=False, free_rig=False)
-    stock = stock_model(folder)
+    stock = stock_model(DATA, folder)
     write(stock, folder / "model", old=True)
     what = folder / "model", folder / "rig.yaml"
     result = uwsfm.refine_model(*what, folder / "out")

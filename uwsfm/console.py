@@ -121,8 +121,10 @@ def result_table(summary: dict[str, Any]) -> Table:
             found[key]
             for key in ("mean_error_of_common_px", "refractive_error_of_common_px")
         )
-        table.add_row("mean error", f"{ours:.3f} px")
-        table.add_row("of the COLMAP model, same observations", f"{own:.3f} px")
+        table.add_row("mean error", _number(ours, "{:.3f} px"))
+        table.add_row(
+            "of the COLMAP model, same observations", _number(own, "{:.3f} px")
+        )
     _add_refined(table, summary.get("refined", ()))
     return table
 

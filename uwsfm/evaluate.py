@@ -78,12 +78,12 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
         cameras=tuple(cameras),
         num_true_frames=len(true_poses),
         num_frames=model.scene.num_frames,
-        center_rms_m=_center_rms(model.scene.rig_from_world, expected),
-        pinhole_center_rms_m=_center_rms(result.start.rig_from_world, expected),
+        center_rms_m=center_rms(model.scene.rig_from_world, expected),
+        pinhole_center_rms_m=center_rms(result.start.rig_from_world, expected),
     )
 
 
-def _center_rms(rig_from_world: Array, expected: Array) -> float:
+def center_rms(rig_from_world: Array, expected: Array) -> float:
     """RMS distance of the rig centres after aligning the first pose only."""
     # world here -> first rig -> true world
     true_from_world = rigid3.compose(rigid3.inverse(expected[0]), rig_from_world[0])

@@ -278,6 +278,8 @@ class _Job:
         after = found.pop("reprojection_rms_px")
         unregistered = [name for name in names if name not in set(model.frame_names)]
         notes = list(self.start.warnings)
+        if self.database is not None:
+            notes += self.database.warnings
         if unregistered:
             notes.append(
                 f"{len(unregistered)} of {len(names)} frames are not in the result: "
@@ -299,13 +301,18 @@ class _Job:
             "colmap_model": {
                 **self.start.summary,
                 "num_common_observations": int(np.count_nonzero(both)),
-                "mean_error_of_common_px": float(np.nanmean(own)),
-                "refractive_error_of_common_px": float(np.nanmean(error)),
+                "mean_error_of_common_px": _mean(own),
+                "refractive_error_of_common_px": _mean(error),
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
             "timings_s": self.timings,
             "versions": versions(),
         }
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None
 
 
 def _without_empty_frames(refined: Refined) -> tuple[Refined, NDArray[np.int64]]:

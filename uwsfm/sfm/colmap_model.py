@@ -157,6 +157,8 @@ def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
     table = table[np.lexsort((table[:, 0], table[:, 1], table[:, 2]))]
     if not len(table):
         raise InputError(f"{folder}: the model has no points that its images see")
+    if not np.isfinite(table[:, 6]).any():
+        raise InputError(f"{folder}: every point lies behind the images that see it")
     index = table[:, :4].astype(np.int64)
     return ImageModel(
         folder=folder,
@@ -232,26 +234,38 @@ def _registered_images(
     return sorted(images, key=lambda image: natural_key(image.name))
 
 
+def places_in_rig(names: Sequence[str], rig: Rig) -> dict[str, tuple[int, str]]:
+    """Camera index and file name below its folder, of the images that are in one.
+
+    A single camera owns all images if none names its folder: there is no doubt.
+    """
+    folders = [camera.images for camera in rig.cameras]
+    found = {
+        name: (c, name[len(folder) + 1 :])
+        for name in names
+        for c, folder in enumerate(folders)
+        if name.startswith(f"{folder}/")
+    }
+    if len(folders) == 1 and not found:
+        return {name: (0, name) for name in names}
+    return found
+
+
 def _places(
     folder: Path, names: Sequence[str], rig: Rig
 ) -> tuple[list[tuple[int, str]], tuple[str, ...]]:
     """Camera index and file name of each image, and what to say about it."""
     folders = [camera.images for camera in rig.cameras]
-    places = []
-    for name in names:
-        mine = [c for c, item in enumerate(folders) if name.startswith(f"{item}/")]
-        if mine:
-            places.append((mine[0], name[len(folders[mine[0]]) + 1 :]))
-    if len(places) == len(names):
-        return places, ()
-    if len(folders) == 1 and not places:  # one camera: there is no doubt whose they are
-        return [(0, name) for name in names], (
+    found = places_in_rig(names, rig)
+    if len(found) == len(names):
+        places = [found[name] for name in names]
+        if places[0][1] != names[0]:
+            return places, ()
+        return places, (
             f"the model does not name the folder of its images: {folders[0]}/ was put "
             "in front of their names",
         )
-    stray = next(
-        name for name in names if not any(name.startswith(f"{f}/") for f in folders)
-    )
+    stray = next(name for name in names if name not in found)
     raise InputError(
         f"{folder}: image {stray} is in no folder of the rig "
         f"({', '.join(f'{item}/' for item in folders)}){_hint(stray, folders)}"

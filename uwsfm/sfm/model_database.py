@@ -20,7 +20,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.background import quiet_colmap
-from uwsfm.sfm.colmap_model import ImageModel
+from uwsfm.sfm.colmap_model import ImageModel, places_in_rig
 from uwsfm.sfm.images import natural_key
 from uwsfm.sfm.mapping.adjustment import adjust_locally, neighbours
 from uwsfm.sfm.mapping.correspondences import Correspondences, in_rows
@@ -47,6 +47,8 @@ class ImageDatabase:
     correspondences: Correspondences
     model_idx: IndexArray
     """(N,) index of each keypoint's observation in the `ImageModel`; -1: none."""
+    warnings: tuple[str, ...]
+    """What the user should know, one sentence each."""
 
 
 def read_image_database(path: Path, model: ImageModel, rig: Rig) -> ImageDatabase:
@@ -74,11 +76,9 @@ def _read(
     path: Path, database: pycolmap.Database, model: ImageModel, rig: Rig
 ) -> ImageDatabase:
     folders = [camera.images for camera in rig.cameras]
-    places = {}
-    for image in database.read_all_images():
-        for c, item in enumerate(folders):
-            if image.name.startswith(f"{item}/"):
-                places[image.image_id] = c, image.name[len(item) + 1 :]
+    ids = {image.name: image.image_id for image in database.read_all_images()}
+    places = {ids[name]: place for name, place in places_in_rig(list(ids), rig).items()}
+    stray = sorted(name for name in ids if ids[name] not in places)
     names = sorted(
         {name for _, name in places.values()} | set(model.frame_names), key=natural_key
     )
@@ -108,6 +108,14 @@ def _read(
             verified=verified,
         ),
         model_idx=model_idx,
+        warnings=(
+            (
+                f"{len(stray)} images of the database were left out, for instance "
+                f"{stray[0]}: they are in no folder of the rig",
+            )
+            if stray
+            else ()
+        ),
     )
 
 
