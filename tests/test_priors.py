@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dense import small_scene
+from test_mixed_ports import mixed_rig
 
 from uwsfm import InputError, calibrate
 from uwsfm.calibration.problem import PRIORS
@@ -13,6 +14,7 @@ from uwsfm.geometry import unit_vector
 from uwsfm.models.lens import param_slots, with_limit
 from uwsfm.residuals import border
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
+from uwsfm.simulate.perturbations import perturbed
 from uwsfm.simulate.rigs import paper_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
 
@@ -30,6 +32,7 @@ KNOWN = {
     "principal_point_stddev_px": 0.3,
     "distortion_stddev": 1e-3,
 }
+OF_FLAT_PORTS = [name for name in PRIORS if name != "center_stddev_m"]
 FX, CX = border.FIRST_LENS, border.FIRST_LENS + 2
 COLUMNS = {
     "distance_stddev_m": [border.DISTANCE],
@@ -54,7 +57,7 @@ def information(covariance):
     return inverse, np.sqrt(np.diag(inverse))
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("name", OF_FLAT_PORTS)
 @pytest.mark.parametrize("rig", [paper_rig(), sample_rig()], ids=["one f", "fx, fy"])
 def test_information_of_a_prior_adds_to_that_of_the_images(rig, name):
     scene = dive(rig).truth
@@ -137,7 +140,7 @@ def noisy_start():
     return replace(scene, cameras=tuple(cameras))
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("name", OF_FLAT_PORTS)
 def test_tight_priors_hold_and_loose_ones_do_nothing(noisy_start, name):
     # Water and lenses together are all but degenerate: see test_lens_refinement.
     water = name == "water_index_stddev"
@@ -173,3 +176,26 @@ def test_impossible_priors_are_refused(name, value):
     with pytest.raises(InputError, match=f"{name} must be positive, got") as refused:
         predict_covariance(small_scene().scene, 0.3, **{name: value})
     assert "\n" not in str(refused.value)
+
+
+def test_prior_of_a_dome_is_of_its_centre_only():
+    """Slots of the centre are those of normal and distance: priors must not mix."""
+    simulated = simulate_scene(
+        mixed_rig(),
+        rich_motion(8),
+        Relief(stddev=0.2),
+        ObservationOptions(num_points=150, noise_px=0.5),
+    )
+    start = perturbed(simulated.scene)  # the dome concentric, the flat port off
+    free = calibrate(start, loss="l2")
+    flat = {"distance_stddev_m": 1e-7, "normal_stddev_deg": 1e-4}
+    tight = calibrate(start, loss="l2", center_stddev_m=1e-7)
+    other = calibrate(start, loss="l2", **flat)
+    centers = [np.array(r.scene.ports[1].center) for r in (free, tight, other)]
+    assert np.linalg.norm(centers[0]) > 0.01
+    assert np.linalg.norm(centers[1]) < 1e-5
+    # The flat port held half as far away as it is pulls a little on the dome.
+    assert np.linalg.norm(centers[2] - centers[0]) < 0.3 * np.linalg.norm(centers[0])
+    distances = [r.scene.ports[0].distance for r in (tight, other)]
+    assert abs(distances[1] - start.ports[0].distance) < 1e-5
+    assert abs(distances[0] - start.ports[0].distance) > 1e-3

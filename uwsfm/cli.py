@@ -54,7 +54,7 @@ PriorOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="KEY=VALUE",
-        help="What is known: distance_stddev_m, normal_stddev_deg, "
+        help="What is known: distance_stddev_m, normal_stddev_deg, center_stddev_m, "
         "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
         "distortion_stddev; may be repeated.",
         show_default=False,

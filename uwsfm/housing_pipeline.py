@@ -229,6 +229,7 @@ def require_effect(options: CalibrateOptions) -> None:
     refined = {
         "distance_stddev_m": ("the port distances", options.refine_distances),
         "normal_stddev_deg": ("the port normals", options.refine_normals),
+        "center_stddev_m": ("the centre of a dome", options.refine_centers),
         "water_index_stddev": ("the water index", options.refine_water_index),
         "focal_stddev": ("the focal length", options.refine_focal),
         "principal_point_stddev_px": (

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.models.port import DOME, FLAT, KIND
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD
@@ -32,11 +33,14 @@ def border_priors(
     reference = State.from_scene(scene)
     stddevs = np.full(columns.shape, np.inf)
     stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
-    stddevs[:, border.DISTANCE] = settings.distance_stddev_m or np.inf
+    flat, dome = (reference.ports[:, KIND] == kind for kind in (FLAT, DOME))
+    stddevs[flat, border.DISTANCE] = settings.distance_stddev_m or np.inf
     # The prior is on the angle's two components; its RMS angle is sqrt(2) of one.
     tilt = np.radians(settings.normal_stddev_deg or np.inf) / np.sqrt(2.0)
-    stddevs[:, border.NORMAL] = tilt
-    stddevs[0, border.WATER_INDEX] = settings.water_index_stddev or np.inf
+    stddevs[flat, border.NORMAL] = tilt
+    stddevs[dome, border.CENTER] = settings.center_stddev_m or np.inf
+    _, waters = np.unique(columns[:, border.WATER_INDEX], return_index=True)
+    stddevs[waters, border.WATER_INDEX] = settings.water_index_stddev or np.inf
     relative = settings.focal_stddev or np.inf
     stddevs[:, [_FX, _FY]] = relative * reference.lenses[:, :2]
     stddevs[:, [_CX, _CY]] = settings.principal_point_stddev_px or np.inf

@@ -27,6 +27,7 @@ DEFAULT_ERRORS = {"joint": "reprojection", "nested": "virtual_camera"}
 PRIORS = (
     "distance_stddev_m",
     "normal_stddev_deg",
+    "center_stddev_m",
     "water_index_stddev",
     "focal_stddev",
     "principal_point_stddev_px",
@@ -86,6 +87,8 @@ class CalibrateOptions:
     that follow; they matter for what is refined only."""
     normal_stddev_deg: float | None = None
     """Root mean square angle."""
+    center_stddev_m: float | None = None
+    """Per coordinate of the centres of domes."""
     water_index_stddev: float | None = None
     focal_stddev: float | None = None
     """Relative: 1e-3 is 0.1 %."""
