@@ -322,7 +322,11 @@ def demo(
 def simulate_images(
     out: Annotated[Path, typer.Option("--out", "-o", help="A new or empty folder.")],
     preset: Annotated[
-        str, typer.Option(help="sample: the one in datasets; small: quick.")
+        str,
+        typer.Option(
+            help="sample: the one in datasets; small: quick; dome: behind domes; "
+            "near: 0.3 m away, ports far off and tilted."
+        ),
     ] = "sample",
     frames: Annotated[
         int | None, typer.Option(help="Only the first frames of the preset.")

@@ -84,10 +84,15 @@ def _port_rows(camera: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     if camera["port"] == "none":
         return [("none", "", "", "")]
     if camera["port"] == "dome":
-        center = ", ".join(f"{1e3 * value:+.2f}" for value in camera["center_m"])
-        spread = [_number(v, "{:.2f}", 1e3) for v in camera["center_stddev_m"]]
-        known = "-" if set(spread) == {"-"} else ", ".join(spread)
-        return [("dome centre (mm)", center, known, camera["center_verdict"])]
+        known = camera["center_stddev_m"]
+        return [
+            (
+                "dome centre (mm)",
+                _millimetres(camera["center_m"]),
+                "-" if None in known else _millimetres(known),
+                camera["center_verdict"],
+            )
+        ]
     return [
         (
             "tilt x, y (deg)",
@@ -177,8 +182,7 @@ def budget_table(summary: dict[str, Any]) -> Table:
                 cells.append(_number(shift["tilt_deg"], "{:.3f}"))
                 cells.append(_number(shift["distance_m"], number, 1e3))
             elif camera["port"] == "dome":
-                moved = [_number(value, number, 1e3) for value in shift["center_m"]]
-                cells.append(", ".join(moved))
+                cells.append(_millimetres(shift["center_m"]))
         table.add_row(row["if"], *cells)
     return table
 
@@ -203,6 +207,14 @@ def comparison_table(comparison: Comparison) -> Table:
             _number(camera.distance_stddev_m, "{:.2f}", 1e3),
             f"{1e3 * camera.true_distance_m:.2f}",
             f"{1e3 * camera.distance_error_m:+.2f}",
+        )
+    for dome in comparison.domes:
+        table.add_row(
+            Text(f"{dome.name}: dome centre (mm)"),
+            _millimetres(dome.center_m),
+            _millimetres(dome.center_stddev_m),
+            _millimetres(dome.true_center_m),
+            f"{1e3 * dome.center_error_m:.2f}",
         )
     registered, given = str(comparison.num_frames), str(comparison.num_true_frames)
     table.add_row("frames", registered, "", given, "")
@@ -254,6 +266,10 @@ def _tilt(normal: list[float] | tuple[float, ...]) -> str:
     """The normal's slopes against the optical axis, which people can imagine."""
     x, y = (math.degrees(math.asin(value)) for value in normal[:2])
     return f"{x:+.3f}, {y:+.3f}"
+
+
+def _millimetres(values: Iterable[float | None]) -> str:
+    return ", ".join(_number(value, "{:.2f}", 1e3) for value in values)
 
 
 def _number(value: float | None, form: str, scale: float = 1.0) -> str:

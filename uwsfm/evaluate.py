@@ -1,6 +1,7 @@
 """An output folder beside the truth of a simulation."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,10 +34,27 @@ class CameraComparison:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DomeComparison:
+    """One camera behind a dome: its centre's estimate, standard deviation, truth."""
+
+    name: str
+    center_m: tuple[float, float, float]
+    center_stddev_m: tuple[float | None, ...]
+    true_center_m: tuple[float, float, float]
+
+    @property
+    def center_error_m(self) -> float:
+        return math.dist(self.center_m, self.true_center_m)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Comparison:
     """A whole reconstruction against the truth."""
 
     cameras: tuple[CameraComparison, ...]
+    """Those behind flat ports."""
+    domes: tuple[DomeComparison, ...]
+    """Those behind domes."""
     num_true_frames: int
     num_frames: int
     center_rms_m: float
@@ -58,8 +76,19 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
     if unknown:
         raise InputError(f"{truth_path}: no pose of frame {sorted(unknown)[0]}")
     expected = np.array([true_poses[name] for name in model.frame_names])
-    cameras = []
+    cameras, domes = [], []
     for entry, camera in zip(result.summary["cameras"], truth["cameras"], strict=True):
+        if entry["port"] == "dome":
+            domes.append(
+                DomeComparison(
+                    name=entry["name"],
+                    center_m=tuple(entry["center_m"]),
+                    center_stddev_m=tuple(entry["center_stddev_m"]),
+                    true_center_m=tuple(camera["center_m"]),
+                )
+            )
+        if entry["port"] != "flat":
+            continue
         cameras.append(
             CameraComparison(
                 name=entry["name"],
@@ -76,6 +105,7 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
         )
     return Comparison(
         cameras=tuple(cameras),
+        domes=tuple(domes),
         num_true_frames=len(true_poses),
         num_frames=model.scene.num_frames,
         center_rms_m=center_rms(model.scene.rig_from_world, expected),

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 
 from uwsfm._files import replaced_dir
 from uwsfm._progress import Progress, silent
@@ -19,8 +20,14 @@ from uwsfm.models.port import DomePort, NoPort, Port
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate.footprints import footprints
+from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rendering import SensorOptions, WaterOptions, render_image
-from uwsfm.simulate.rigs import known_cam_from_rig, nominal_rig, sample_rig
+from uwsfm.simulate.rigs import (
+    known_cam_from_rig,
+    nominal_rig,
+    sample_rig,
+    stereo_rig,
+)
 from uwsfm.simulate.sea_floor import SeaFloorOptions, build_sea_floor
 from uwsfm.simulate.trajectories import rich_motion
 
@@ -82,9 +89,59 @@ def small_spec() -> SequenceSpec:
     )
 
 
+def dome_spec() -> SequenceSpec:
+    """The small dive behind domes, a centimetre off their centres."""
+    small = small_spec()
+    places = ((0.002, -0.003, 0.008), (-0.003, 0.001, 0.012))
+    cameras = tuple(
+        replace(
+            camera,
+            port=DomePort(place, 0.05, 0.007, 1.49, 1.333),
+            refine_normal=False,
+            refine_distance=False,
+            refine_center=True,
+        )
+        for camera, place in zip(small.rig.cameras, places, strict=True)
+    )
+    return replace(small, rig=replace(small.rig, cameras=cameras))
+
+
+def near_spec() -> SequenceSpec:
+    """Where pinholes fail: 0.3 m away, ports at 12 cm tilted by 10 degrees, relief."""
+    params = [295.0, 295.0, 200.0, 150.0]
+    left, right = (
+        pycolmap.Camera(model="PINHOLE", width=400, height=300, params=params)
+        for _ in range(2)
+    )
+    rig = stereo_rig(
+        (left, right),
+        distance=0.12,
+        thickness=0.01,
+        tilts_deg=((10.0, 40.0), (8.0, -60.0)),
+        baseline=0.08,
+    )
+    spec = SequenceSpec(
+        rig=rig,
+        rig_from_world=rich_motion(14, altitude=0.42, extent=0.14),
+        floor=SeaFloorOptions(
+            relief=Relief(stddev=0.02, correlation_length=0.12),
+            num_boulders=9,
+            boulder_radius=(0.015, 0.05),
+            boulder_extent=0.25,
+            texel=0.0004,
+            mesh_step=0.005,
+        ),
+        max_range=1.2,
+    )
+    spec = replace(spec, sensor=replace(spec.sensor, samples_per_side=2))
+    return reseeded(spec, 3)
+
+
 PRESETS: dict[str, Callable[[], SequenceSpec]] = {
     "sample": sample_spec,
     "small": small_spec,
+    "dome": dome_spec,
+    "near": near_spec,
 }
 
 
