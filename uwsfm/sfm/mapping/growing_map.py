@@ -53,6 +53,12 @@ class GrowingMap:
         self.cam_from_rig = cam_from_rig
         self.set_cameras(cameras, cam_from_rig)
 
+    def emptied(self) -> GrowingMap:
+        """A map of the same images and cameras without frames."""
+        return GrowingMap(
+            self.correspondences, self.cameras, self.cam_from_rig, self.min_angle
+        )
+
     @property
     def num_registered(self) -> int:
         return int(np.count_nonzero(self.registered))

@@ -18,6 +18,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
+from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.adjustment import (
     Housings,
     adjust_globally,
@@ -26,18 +27,20 @@ from uwsfm.sfm.mapping.adjustment import (
 )
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
+from uwsfm.sfm.mapping.initialization import (
+    MAX_ERROR_PX,
+    MIN_ERROR_PX,
+    MIN_POINTS,
+    Beginning,
+    beginnings,
+    start_tolerance_px,
+)
 from uwsfm.sfm.mapping.registration import register_next
 from uwsfm.sfm.options import StartOptions
 
-MIN_SEED_POINTS = 30
-"""That the cameras of the first frame see together."""
 MIN_FRAMES_FOR_HOUSINGS = 3
-START_GAPS = 5.0
-"""Times the median gap of the matches of single frames: the tolerance at the start."""
 END_ERRORS = 6.0
 """Times the median error: the tolerance once the housings are adjusted."""
-MIN_ERROR_PX = 4.0
-MAX_ERROR_PX = 30.0
 MIN_IMAGES = 3
 """That see a point of the finished map."""
 GROWTH = 1.25
@@ -66,73 +69,34 @@ def map_incrementally(
     Raises:
         UwsfmError: nothing could be reconstructed.
     """
+    empty = GrowingMap(
+        correspondences,
+        rig.refractive_cameras(),
+        cam_from_rig,
+        np.radians(options.mapping.min_angle_deg),
+    )
+    num_frames = correspondences.num_frames
+    left = np.ones(num_frames, dtype=bool)
+    maps: list[GrowingMap] = []
+    num_tried = 0
     with threadpool_limits(1, user_api="blas"):  # the same sums on every machine
-        return _Maps(correspondences, rig, cam_from_rig, options, progress).all()
-
-
-class _Maps:
-    """One map after the other, until no frame is left to begin with."""
-
-    def __init__(
-        self,
-        correspondences: Correspondences,
-        rig: Rig,
-        cam_from_rig: Array,
-        options: StartOptions,
-        progress: Progress,
-    ) -> None:
-        self.of = correspondences
-        self.rig = rig
-        self.cam_from_rig = cam_from_rig
-        self.options = options
-        self.progress = progress
-
-    def all(self) -> list[GrowingMap]:
-        max_error_px, seeds = self._seeds()
-        left = np.ones(self.of.num_frames, dtype=bool)
-        maps: list[GrowingMap] = []
-        for frame in seeds:
-            largest = max((m.num_registered for m in maps), default=1)
-            if largest >= np.count_nonzero(left):
-                break
-            if not left[frame]:
-                continue
-            growing = self._empty()
-            grower = _Grower(
-                growing, self.rig, max_error_px, self.options.seed, self.progress
-            )
-            grower.begin_with_frame(frame)
-            grower.grow()
+        tolerance = start_tolerance_px(empty)
+        ways = beginnings(
+            empty, left, tolerance, options.scene_distance_m, options.seed
+        )
+        for beginning in ways:
+            num_tried += 1
+            growing = empty.emptied()
+            _Grower(growing, rig, tolerance, options.seed, progress).grow(beginning)
             left &= ~growing.registered
             if growing.num_registered > 1:
                 maps.append(growing)
-        if not maps:
-            raise UwsfmError(_why_empty(self.of, seeds))
-        return sorted(maps, key=lambda m: -m.num_registered)
-
-    def _empty(self) -> GrowingMap:
-        return GrowingMap(
-            self.of,
-            self.rig.refractive_cameras(),
-            self.cam_from_rig,
-            np.radians(self.options.mapping.min_angle_deg),
-        )
-
-    def _seeds(self) -> tuple[float, list[int]]:
-        """The tolerance at the start, px, and frames to begin with, best first."""
-        of, growing = self.of, self._empty()
-        frames = of.frame[of.matches]
-        same_frame = np.flatnonzero(frames[:, 0] == frames[:, 1])
-        growing.place(np.arange(of.num_frames), growing.rig_from_world)
-        gaps = growing.gaps_px(same_frame)
-        typical = np.nanmedian(gaps[of.verified[same_frame]])
-        max_error_px = float(np.clip(START_GAPS * typical, MIN_ERROR_PX, MAX_ERROR_PX))
-        linked = np.zeros(len(of.xy), dtype=bool)
-        linked[of.matches[of.verified & (frames[:, 0] != frames[:, 1])]] = True
-        useful = linked[of.matches[same_frame]].any(axis=1) & (gaps <= max_error_px)
-        counts = np.bincount(frames[same_frame[useful], 0], minlength=of.num_frames)
-        order = np.argsort(-counts, kind="stable")
-        return max_error_px, order[counts[order] >= MIN_SEED_POINTS].tolist()
+            largest = max((m.num_registered for m in maps), default=1)
+            if largest >= np.count_nonzero(left):
+                break
+    if not maps:
+        raise UwsfmError(_why_empty(num_tried))
+    return sorted(maps, key=lambda m: -m.num_registered)
 
 
 class _Grower:
@@ -154,37 +118,36 @@ class _Grower:
         self.housings = Housings.of(rig, growing)
         self.housings_moved = False
 
-    def begin_with_frame(self, frame: int) -> None:
-        """A frame of a rig: its own matches, metric."""
-        self.map.place(np.array([frame]), self.map.rig_from_world)
-        self.map.retriangulate(self.max_error_px)
-
-    def grow(self) -> None:
+    def grow(self, beginning: Beginning) -> None:
         """Register frames until none fits; what failed is tried again once everything
         has been adjusted."""
         growing, total = self.map, self.map.correspondences.num_frames
-        last_global = 1
+        self._place(beginning.frames, beginning.rig_from_world)
+        growing.retriangulate(self.max_error_px)
+        if growing.num_registered > 1:
+            self._adjust_all(rounds=2)
+        last_global = growing.num_registered
         while True:
             self.progress("mapping", growing.num_registered, total)
-            added = register_next(growing, self.max_error_px, self.seed)
+            added = None
+            if growing.num_registered < total:
+                added = register_next(growing, self.max_error_px, self.seed)
             count = growing.num_registered
-            if added is None:
-                if count < total and count > last_global:
-                    self._adjust_all(rounds=2)
-                    last_global = count
-                    continue
-                if count > last_global:
-                    self._adjust_all(rounds=1)
-                # The end: what only two images saw stays out.
-                if count > 1:
-                    growing.retriangulate(self.max_error_px, MIN_IMAGES)
-                return
-            elif count >= GROWTH * last_global:
-                self._adjust_all(rounds=1)
-                last_global = count
-            else:
+            if added is not None and count < GROWTH * last_global:
                 adjust_locally(growing, neighbours(growing, added))
                 growing.filter(self.max_error_px)
+            elif count > last_global:
+                self._adjust_all(rounds=1 if added is not None else 2)
+                last_global = count
+            else:
+                break
+        if growing.num_registered > 1:
+            growing.retriangulate(self.max_error_px, MIN_IMAGES)
+
+    def _place(self, frames: IndexArray, rig_from_world: Array) -> None:
+        poses = self.map.rig_from_world.copy()
+        poses[frames] = rig_from_world
+        self.map.place(frames, poses)
 
     def _adjust_all(self, rounds: int) -> None:
         growing = self.map
@@ -209,16 +172,16 @@ class _Grower:
             growing.retriangulate(self.max_error_px)
 
 
-def _why_empty(of: Correspondences, seeds: list[int]) -> str:
-    """The sentence for a map without a second frame."""
-    if not seeds:
+def _why_empty(num_tried: int) -> str:
+    """The sentence for no map at all."""
+    if num_tried == 0:
         return (
-            "no map could be built: in no frame do the cameras share "
-            f"{MIN_SEED_POINTS} points that other frames see too; do consecutive "
-            "images overlap, is the water clear enough?"
+            "no map could be built: neither do the cameras of a frame share "
+            f"{MIN_POINTS} points that other frames see too, nor do two frames; do "
+            "consecutive images overlap, is the water clear enough?"
         )
     return (
-        f"no map could be built, though {len(seeds)} frames could begin one: did the "
+        f"no map could be built, though there were {num_tried} ways to begin: did the "
         "rig move between the frames, and do the in-air intrinsics and cam_from_rig "
         "belong to these images?"
     )
