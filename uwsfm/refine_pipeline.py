@@ -287,8 +287,14 @@ class _Job:
                 f"{' ...' if len(unregistered) > 10 else ''}"
             )
         both = model_idx >= 0
-        own = self.start.model.own_error_px[model_idx[both]]
-        error = model.errors_px()[both]
+        own = _mean(self.start.model.own_error_px[model_idx[both]])
+        error = _mean(model.errors_px()[both])
+        if own is not None and error is not None and error > CLEARLY_WORSE * own:
+            notes.append(
+                f"the cameras of the COLMAP model fit the same observations better "
+                f"({own:.2f} px) than lenses behind ports ({error:.2f} px): are the "
+                "lenses of the rig file those of the air, and its ports of that kind?"
+            )
         return {
             "num_frames": len(names),
             "unregistered_frames": unregistered,
@@ -301,8 +307,8 @@ class _Job:
             "colmap_model": {
                 **self.start.summary,
                 "num_common_observations": int(np.count_nonzero(both)),
-                "mean_error_of_common_px": _mean(own),
-                "refractive_error_of_common_px": _mean(error),
+                "mean_error_of_common_px": own,
+                "refractive_error_of_common_px": error,
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
             "timings_s": self.timings,

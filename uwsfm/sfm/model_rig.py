@@ -221,11 +221,15 @@ def _scale(
         if pairs.length is not None
     ]
     if not ratios:
+        examples = (
+            f"{item.images}/{model.frame_names[int(np.argmax(there))]}"
+            for item, there in zip(rig.cameras, model.registered, strict=True)
+        )
         raise InputError(
             f"{model.folder}: no frame has a registered image of "
-            f"{rig.cameras[0].name!r} and one of another camera under the same name: "
-            "the baseline cannot give the model its scale (images of one frame have "
-            "equal names)"
+            f"{rig.cameras[0].name!r} and one of another camera, so that the baseline "
+            "cannot give the model its scale: images of one frame need equal names, "
+            f"the first ones are {' and '.join(examples)}"
         )
     if max(ratios) > MAX_SCALE_RATIO * min(ratios):
         raise InputError(
@@ -275,11 +279,16 @@ def _checked_start(
     notes, poses = [], np.asarray(rig.cam_from_rig)
     if enough:
         check_rig(rig, poses, matches)
-        rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
-        check_rotation(rig, rotation, matches)
-        notes = rotation.warnings(rig)
-        if rig.refine_cam_from_rig:
-            poses = rotation.cam_from_rig
+        if any(item.refine_center for item in rig.cameras):
+            # A dome off its centre scales the image: no turn makes up for that.
+            if rig.refine_cam_from_rig:
+                poses = metric
+        else:
+            rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
+            check_rotation(rig, rotation, matches)
+            notes = rotation.warnings(rig)
+            if rig.refine_cam_from_rig:
+                poses = rotation.cam_from_rig
     for pairs in found:
         sentence = _contradiction(pairs, rig)
         if sentence and not enough:
