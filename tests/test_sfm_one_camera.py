@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sfm_scenes import frames_of, simulated_dive, write_features
+from sfm_scenes import simulated_dive
 from test_mixed_ports import mixed_rig
 
 from uwsfm import DomePort, InputError
@@ -12,6 +12,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.rig import Rig
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.perspective import StartArrays, read_start
+from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
