@@ -129,6 +129,20 @@ def test_names_that_do_not_pair_images_are_refused(dive, plain, tmp_path, names,
         uwsfm.refine_model(folder, dive.rig, tmp_path / "out")
 
 
+def test_a_few_wrong_pairs_are_named_and_lose_one_image(dive, plain, tmp_path):
+    """The right images of two frames are exchanged: the other frames know the rig."""
+    swap = {"right/0002.jpg": "right/0006.jpg", "right/0006.jpg": "right/0002.jpg"}
+    folder = renamed(plain, tmp_path / "model", lambda name: swap.get(name, name))
+    result = uwsfm.refine_model(folder, dive.rig, tmp_path / "out")
+    text = "in 2 frames, for instance 0002.jpg, the poses of the images contradict"
+    assert any(text in note for note in result.summary["warnings"])
+    scene = result.model.scene
+    for frame in (2, 6):
+        cameras = scene.camera_idx[scene.frame_idx == frame]
+        assert len(np.unique(cameras)) == 1 and len(cameras) > 100
+    assert result.summary["sigma_px"] == pytest.approx(0.3, rel=0.05)
+
+
 def test_folders_without_a_usable_model_are_refused(dive, plain, tmp_path):
     out = tmp_path / "out"
 

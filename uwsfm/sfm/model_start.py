@@ -81,6 +81,15 @@ def start_from_model(
     if not len(kept):
         raise InputError(f"{found.folder}: no frame has a pose that its points support")
     warnings = [*model.warnings, *agreed.warnings]
+    in_doubt = np.flatnonzero(np.any(agreed.doubtful, axis=0))
+    if len(in_doubt):
+        example = model.frame_names[in_doubt[0]]
+        warnings.append(
+            f"in {len(in_doubt)} frames, for instance {example}, the poses of the "
+            "images contradict the rig of the other frames: their poses were "
+            "found anew, and an image that was not taken at the same time as the "
+            "others loses its observations"
+        )
     if lost:
         names = ", ".join(model.frame_names[f] for f in lost[:10])
         warnings.append(
