@@ -14,10 +14,10 @@ from uwsfm.geometry.p3p import poses_from_three
 from uwsfm.models.status import VALID
 from uwsfm.residuals.reprojection import residual
 from uwsfm.solver.losses import LOSS_CODES
-from uwsfm.solver.rig_pose import in_rig, refine_pose, squared_errors
+from uwsfm.solver.rig_pose import copy_into, in_rig, refine_pose, squared_errors
 
 CAUCHY = LOSS_CODES["cauchy"]
-LOCAL_ITERATIONS = 5
+LOCAL_ITERATIONS = 3
 # Samples drawn of inliers alone still miss, through noise, about this often.
 MIN_GOOD = 0.5
 
@@ -81,11 +81,11 @@ def search_pose(samples, rays, matches, rig, limit, best, pose):
             if not error < best:
                 continue
             best, inliers = error, count
-            pose[:] = poses[n]
+            copy_into(pose, poses[n])
             if count < 4:
                 continue
             squared_errors(pose, matches, rig, squares)
-            local[:] = pose
+            copy_into(local, pose)
             refine_pose(
                 local,
                 matches,
@@ -98,5 +98,5 @@ def search_pose(samples, rays, matches, rig, limit, best, pose):
             error, count = truncated_error(local, matches, rig, limit, best)
             if error < best:
                 best, inliers = error, count
-                pose[:] = local
+                copy_into(pose, local)
     return best, inliers

@@ -16,7 +16,13 @@ from uwsfm.geometry.vec3 import dot
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
 from uwsfm.solver.losses import INVALID_PX, rho
-from uwsfm.solver.rig_pose import in_rig, moved_pose, solve_damped
+from uwsfm.solver.rig_pose import (
+    copy_into,
+    in_rig,
+    moved_pose,
+    slope_along,
+    solve_damped,
+)
 
 MIN_RELATIVE_DECREASE = 1e-7
 MAX_DAMPING = 1e10
@@ -284,7 +290,7 @@ def refine_pair(pose, matches, use, rig, robust, length_prior, max_iterations):
                 trial_hessian,
                 trial_grad,
             )
-            if not found < cost and not -np.dot(grad, step) > 1e-12 * cost:
+            if not found < cost and not -slope_along(grad, step) > 1e-12 * cost:
                 break
         if not found < cost:
             damping, growth = damping * growth, growth * 2.0
@@ -292,9 +298,10 @@ def refine_pair(pose, matches, use, rig, robust, length_prior, max_iterations):
                 break
             continue
         decrease = cost - found
-        pose[:], cost = trial, found
-        hessian[:] = trial_hessian
-        grad[:] = trial_grad
+        cost = found
+        copy_into(pose, trial)
+        copy_into(hessian, trial_hessian)
+        copy_into(grad, trial_grad)
         damping, growth = 0.1 * damping, 4.0
         if decrease < MIN_RELATIVE_DECREASE * cost or not cost > 1e-22 * len(use):
             break

@@ -153,6 +153,23 @@ def solve_damped(hessian, grad, damping, factor, step):
 
 
 @kernel
+def copy_into(out, values):
+    """out[:] = values, of which numba would compile the error message too."""
+    flat_out, flat_values = out.ravel(), values.ravel()
+    for i in range(len(flat_values)):
+        flat_out[i] = flat_values[i]
+
+
+@kernel
+def slope_along(grad, step):
+    """<grad, step>"""
+    total = 0.0
+    for i in range(len(step)):
+        total += grad[i] * step[i]
+    return total
+
+
+@kernel
 def moved_pose(pose, step, out):
     """The row of [R | t] after a left perturbation, see `rigid3.perturb`; written."""
     x, y, z = step[0], step[1], step[2]
@@ -198,13 +215,13 @@ def refine_pose(pose, matches, use, rig, loss, scale, max_iterations):
         decrease = cost - found
         if not decrease > 0.0:
             # At the minimum nothing but rounding is left to gain.
-            if not -np.dot(grad, step) > 1e-12 * cost:
+            if not -slope_along(grad, step) > 1e-12 * cost:
                 break
             damping, growth = damping * growth, growth * 2.0
             if damping > MAX_DAMPING:
                 break
             continue
-        pose[:] = trial
+        copy_into(pose, trial)
         damping, growth = 0.1 * damping, 4.0
         small = decrease < MIN_RELATIVE_DECREASE * cost
         cost = normal_equations(pose, matches, use, rig, loss, scale, hessian, grad)
