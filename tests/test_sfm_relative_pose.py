@@ -1,11 +1,12 @@
 """Relative pose from matches: exact, robust, and honest about the length."""
 
 import numpy as np
+import pycolmap
 import pytest
 from jacobians import check_jacobian, tilted
 from test_sfm_absolute_pose import SIZE, camera, four_cameras, offset
 
-from uwsfm import InputError
+from uwsfm import DomePort, InputError, RefractiveCamera
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
 from uwsfm.models.projection import JAC_SIZE
@@ -161,6 +162,24 @@ def test_hard_geometry(depth, motion, rng):
     assert np.count_nonzero(found.inliers & right) > 0.98 * np.count_nonzero(right)
     error = offset(found.b_from_a, truth)
     assert error[:3] @ np.linalg.solve(found.covariance[:3, :3], error[:3]) < 16.3
+
+
+def test_field_of_view_beyond_any_pinhole(rng):
+    """A fisheye behind a dome: directions up to the plane of the camera and past it."""
+    lens = pycolmap.Camera(
+        model="OPENCV_FISHEYE",
+        width=1920,
+        height=1080,
+        params=[560.0, 560.0, 960.0, 540.0, 0.0, 0.0, 0.0, 0.0],
+    )
+    port = DomePort((0.002, 0.001, -0.01), 0.06, 0.01, 1.49, 1.34)
+    rig = [RefractiveCamera(lens, port)], np.array([rigid3.IDENTITY])
+    args, truth, right = two_views(rig, WIDE, rng, noise_px=0.3, wrong=0.3)
+    found = estimate_relative_pose(*image_pair(args))
+    assert np.count_nonzero(found.inliers & right) > 0.98 * np.count_nonzero(right)
+    error = offset(found.b_from_a, truth)[:3]
+    # 99.9 % of chi-square with 3 degrees.
+    assert error @ np.linalg.solve(found.covariance[:3, :3], error) < 16.3
 
 
 def test_gap_is_that_of_the_epipolar_module(rng):

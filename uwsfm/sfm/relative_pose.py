@@ -1,10 +1,10 @@
 """Relative pose of two refractive cameras, or of two frames of a rig, from matches.
 
-Hypotheses come from pinholes: seen from where they nearly meet, the directions of the
-water rays of an image are those of a central camera far away, good to some pixels.
-Everything after that is exact: the length of the motion, which says how near the scene
-is and so how much the rays of a camera differ, is searched, and all six parameters are
-adjusted on the gaps of the water rays in true pixels.
+Hypotheses come from central cameras: seen from where they nearly meet, the water rays
+of an image are those of a scene far away, good to some pixels. Everything after that is
+exact: the length of the motion, which says how near the scene is and so how much the
+rays of a camera differ, is searched, and all six parameters are adjusted on the gaps of
+the water rays in true pixels.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from uwsfm.sfm.kernel_rows import (
     rig_rows,
 )
 from uwsfm.sfm.relative_pose_options import RelativePoseOptions
-from uwsfm.sfm.relative_pose_start import MotionLine, image_pairs, pinhole_pose
+from uwsfm.sfm.relative_pose_start import MotionLine, central_pose, image_pairs
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.rig_pair import (
     gaps,
@@ -61,7 +61,6 @@ no other one could show that it is wrong. Three times the average, for few match
 LIKELY_STDDEVS = np.linspace(-2.0, 2.0, 9)
 HELD_WEIGHT = 1e10
 """Of a length that is held, pixels squared: any number of matches weighs less."""
-LOG_DISTANCE_STDDEV = math.log(10.0)
 MAX_LENGTH_STDDEV = 0.25
 """A length known less well than this, relative, is called not determined."""
 
@@ -163,9 +162,9 @@ def estimate_rig_relative_pose(
     matches = (index_a, pixels_a, rays_a, index_b, pixels_b, rays_b)
     usable = finite_rows(rays_a) & finite_rows(rays_b)
     best, best_error = None, np.inf
-    ransac = _ransac_options(options)
     for rows, a, b in image_pairs(index_a, index_b, usable):
-        moved = pinhole_pose(cameras, near_a[rows], near_b[rows], a, b, ransac)
+        ransac = _ransac_options(options, (cameras[a], cameras[b]))
+        moved = central_pose(near_a[rows], near_b[rows], ransac)
         if moved is None:
             continue
         line = MotionLine.through(moved, poses[a], poses[b], centres_a[a], centres_b[b])
@@ -177,9 +176,13 @@ def estimate_rig_relative_pose(
     return None if best is None else _refined(best, matches, usable, rig, options)
 
 
-def _ransac_options(options: RelativePoseOptions) -> pycolmap.RANSACOptions:
+def _ransac_options(
+    options: RelativePoseOptions, pair: tuple[RefractiveCamera, RefractiveCamera]
+) -> pycolmap.RANSACOptions:
+    """For directions in the water, whose pixels are smaller than in air."""
+    focals = [camera.port.n_water * np.mean(camera.lens[:2]) for camera in pair]
     return pycolmap.RANSACOptions(
-        max_error=options.max_pinhole_error_px,
+        max_error=options.max_central_error_px / float(np.mean(focals)),
         confidence=options.confidence,
         min_num_trials=options.min_trials,
         max_num_trials=options.max_trials,
@@ -204,7 +207,7 @@ def _lengths(
         lengths = options.length_m * np.unique(np.exp(spread))
     errors = []
     for length in lengths:
-        error = _truncated(line.at(length), matches, rig, options.max_pinhole_error_px)
+        error = _truncated(line.at(length), matches, rig, options.max_central_error_px)
         errors.append(float(np.sum(error[usable])))
     padded = np.array([np.inf, *errors, np.inf])
     lowest = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] < padded[2:]))
@@ -213,10 +216,10 @@ def _lengths(
 
 
 def _scene_distance(pose: Array, matches: PairRows, use: Mask) -> float:
-    """Median distance of where the rays meet from the second rig; NaN if nowhere."""
+    """Median distance of where the rays meet from the first rig; NaN if nowhere."""
     points = np.empty((len(use), 3))
     midpoints(pose, matches, points)
-    distances = np.linalg.norm(points[use], axis=1)
+    distances = np.linalg.norm(points[use] - pose[3::4], axis=1)
     distances = distances[np.isfinite(distances)]
     return float(np.median(distances)) if len(distances) else math.nan
 
@@ -246,7 +249,8 @@ def _length_prior(
     if not (length > 0.0 and distance > 0.0):
         return 0.0, 0.0
     likely = options.scene_distance_m * length / distance
-    return math.log(likely), (noise_px / LOG_DISTANCE_STDDEV) ** 2
+    weight = (noise_px / math.log(options.scene_distance_factor)) ** 2
+    return math.log(likely), weight
 
 
 def _adjusted(
@@ -258,7 +262,7 @@ def _adjusted(
 ) -> float:
     """Adjust a start, in place, to all matches robustly; its truncated error."""
     cauchy = LOSS_CODES["cauchy"]
-    for scale in (options.max_pinhole_error_px / 3.0, options.max_error_px / 3.0):
+    for scale in (options.max_central_error_px / 3.0, options.max_error_px / 3.0):
         prior = _length_prior(pose, matches, usable, START_NOISE_PX, options)
         refine_pair(
             pose, matches, usable, rig, (cauchy, scale), prior, options.max_iterations

@@ -11,11 +11,12 @@ from uwsfm.errors import InputError
 class RelativePoseOptions:
     """How a relative pose is searched and adjusted."""
 
-    max_error_px: float = 4.0
+    max_error_px: float = 6.0
     """Gap of the water rays above which a match is an outlier. The final adjustment
     cuts at `cut_stddevs` of the noise that it finds, so this may be generous."""
-    max_pinhole_error_px: float = 12.0
-    """The same for the pinholes that hypotheses come from, which know no distance."""
+    max_central_error_px: float = 12.0
+    """The same for the central cameras that hypotheses come from, for which a scene is
+    far away."""
     confidence: float = 0.9999
     min_trials: int = 200
     max_trials: int = 20000
@@ -28,18 +29,21 @@ class RelativePoseOptions:
     length_stddev: float = 0.0
     """Of the logarithm of ``length_m``, that is relative; 0 holds the length."""
     scene_distance_m: float = 2.0
-    """What the median distance of the scene is taken for where nothing else tells it;
-    known to a factor of ten (one standard deviation), so that it weighs nothing where
-    refraction or the rig says more."""
+    """What the median distance of the scene from the first view is taken for, where
+    neither ``length_m`` nor refraction nor the rig says more."""
+    scene_distance_factor: float = 3.0
+    """How well that is known: a factor of so much is one standard deviation."""
     max_iterations: int = 50
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive = (self.max_error_px, self.max_pinhole_error_px, self.cut_stddevs)
+        positive = (self.max_error_px, self.max_central_error_px, self.cut_stddevs)
         if not min(positive) > 0.0 or not self.scene_distance_m > 0.0:
             raise InputError(
                 "errors, cut_stddevs and scene_distance_m must be positive"
             )
+        if not self.scene_distance_factor > 1.0:
+            raise InputError("scene_distance_factor must be above 1")
         if not 0.0 < self.confidence < 1.0:
             raise InputError(f"confidence must be in (0, 1), got {self.confidence}")
         if self.min_num_inliers < 6 or not 0 < self.min_trials <= self.max_trials:

@@ -1,8 +1,7 @@
-"""Where the search for a relative pose starts: pinholes, and the length left open."""
+"""Where the search for a relative pose starts: central cameras, any length."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.kernel_rows import IndexArray
 
 Mask = NDArray[np.bool_]
@@ -34,34 +32,16 @@ def image_pairs(
     return sorted(found, key=lambda pair: -len(pair[0]))[:MAX_PAIRS]
 
 
-def pinhole_pose(
-    cameras: Sequence[RefractiveCamera],
-    rays_a: Array,
-    rays_b: Array,
-    a: int,
-    b: int,
-    ransac: pycolmap.RANSACOptions,
+def central_pose(
+    rays_a: Array, rays_b: Array, ransac: pycolmap.RANSACOptions
 ) -> Array | None:
     """Pose (7,) between the points where rays nearly meet, its length unknown.
 
     Args:
-        cameras: (C,)
         rays_a, rays_b: (N, 6) water rays in their cameras.
-        a, b: the cameras.
-        ransac: errors are pixels of pinholes, about as large as true ones.
+        ransac: its error is in radians.
     """
-    pixels, pinholes = [], []
-    for rays, c in ((rays_a, a), (rays_b, b)):
-        focal = cameras[c].port.n_water * float(np.mean(cameras[c].lens[:2]))
-        pinholes.append(
-            pycolmap.Camera(
-                model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0]
-            )
-        )
-        pixels.append(focal * rays[:, 3:5] / rays[:, 5:])
-    answer = pycolmap.estimate_essential_matrix(
-        pixels[0], pixels[1], pinholes[0], pinholes[1], ransac
-    )
+    answer = pycolmap.estimate_relative_pose(rays_a[:, 3:], rays_b[:, 3:], ransac)
     if answer is None:
         return None
     return np.array(answer["cam2_from_cam1"].params)

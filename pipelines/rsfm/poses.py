@@ -1,0 +1,210 @@
+"""Absolute and relative poses on the protocol of Refractive COLMAP's paper.
+
+    python pipelines/rsfm/poses.py -o OUT [--absolute 1000] [--relative 300]
+
+OUT receives poses.md and two CSV files. Every method sees the same trials; times are of
+one thread, without the making of the trials.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+sys.path.append(str(Path(__file__).parent.parent / "paper"))
+
+from pose_methods import (  # noqa: E402
+    ABSOLUTE,
+    RELATIVE,
+    absolute_bound,
+    absolute_errors,
+    relative_bound,
+    relative_errors,
+)
+from pose_trials import PORTS, absolute_trial, relative_trial  # noqa: E402
+from tables import Row, markdown, write_csv  # noqa: E402
+
+from uwsfm._files import replaced_file  # noqa: E402
+
+NOISES_PX = (0.0, 0.5, 1.2, 2.0)
+PEER = "Refractive COLMAP"
+# Its medians and times per pose, measured with its own programs: see README.md.
+PEER_ABSOLUTE = {
+    ("flat", 0.5): (0.0038, 0.141),
+    ("flat", 1.2): (0.0102, 0.349),
+    ("flat", 2.0): (0.0177, 0.609),
+    ("dome", 0.5): (0.0047, 0.165),
+    ("dome", 1.2): (0.0126, 0.448),
+    ("dome", 2.0): (0.0229, 0.779),
+}
+PEER_RELATIVE = {("flat", 0.0): (0.21, 0.27), ("flat", 0.5): (0.153, 0.156)}
+PEER_ABSOLUTE_MS, PEER_RELATIVE_MS = "6.8-12", "145"
+
+
+def main() -> None:
+    options = parse()
+    options.out.mkdir(parents=True, exist_ok=True)
+    with threadpool_limits(1):
+        absolute = study_absolute(options.absolute)
+        relative = study_relative(options.relative)
+    write_csv(absolute, options.out / "absolute_pose.csv")
+    write_csv(relative, options.out / "relative_pose.csv")
+    with replaced_file(options.out / "poses.md") as partial:
+        partial.write_text(page(absolute, relative, options), encoding="utf-8")
+    print(options.out / "poses.md")
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--absolute", type=int, default=1000, metavar="RUNS")
+    parser.add_argument("--relative", type=int, default=300, metavar="RUNS")
+    options = parser.parse_args()
+    if min(options.absolute, options.relative) < 1:
+        parser.error("it takes one run at least")
+    return options
+
+
+def study_absolute(runs: int) -> list[Row]:
+    rows: list[Row] = []
+    for port in PORTS:
+        for noise in NOISES_PX:
+            label = f"absolute, {port}, {noise} px"
+            errors = run_all(
+                [absolute_trial(port, noise, seed) for seed in range(runs)],
+                ABSOLUTE,
+                absolute_errors,
+                label,
+            )
+            rng = np.random.default_rng(0)
+            draws = [
+                draw
+                for seed in range(runs)
+                for draw in absolute_bound(
+                    absolute_trial(port, noise, seed), noise, rng
+                )
+            ]
+            peer = PEER_ABSOLUTE.get((port, noise))
+            rows += rows_of(
+                port, noise, errors, ("position_mm", PEER_ABSOLUTE_MS), peer
+            )
+            rows.append(row_of(port, noise, "bound", draws, "position_mm"))
+    return rows
+
+
+def study_relative(runs: int) -> list[Row]:
+    rows: list[Row] = []
+    for port in PORTS:
+        for noise in NOISES_PX:
+            label = f"relative, {port}, {noise} px"
+            trials = [relative_trial(port, noise, seed) for seed in range(runs)]
+            errors = run_all(trials, RELATIVE, relative_errors, label)
+            peer = PEER_RELATIVE.get((port, noise))
+            measured = ("direction_deg", PEER_RELATIVE_MS)
+            rows += rows_of(port, noise, errors, measured, peer)
+            rng = np.random.default_rng(0)
+            draws = [d for trial in trials for d in relative_bound(trial, noise, rng)]
+            rows.append(row_of(port, noise, "bound", draws, "direction_deg"))
+    return rows
+
+
+Errors = dict[str, list[tuple[float, float, float]]]
+"""By method: rotation, position or direction, milliseconds of each trial."""
+
+
+def run_all(
+    trials: Sequence[Any],
+    methods: dict[str, Callable[[Any], Any]],
+    errors_of: Callable[[Any, Any], tuple[float, float]],
+    label: str,
+) -> Errors:
+    found: Errors = {name: [] for name in methods}
+    for name, method in methods.items():
+        method(trials[0])  # loads kernels: not timed
+        for trial in track(trials, f"{label}: {name}", transient=True):
+            began = time.process_time()
+            pose = method(trial)
+            spent = 1e3 * (time.process_time() - began)
+            pair = (np.inf, np.inf) if pose is None else errors_of(pose, trial)
+            found[name].append((*pair, spent))
+    return found
+
+
+def rows_of(
+    port: str,
+    noise: float,
+    errors: Errors,
+    measured: tuple[str, str],
+    peer: tuple[float, float] | None,
+) -> list[Row]:
+    second, peer_ms = measured
+    rows = [row_of(port, noise, name, runs, second) for name, runs in errors.items()]
+    if peer is not None:
+        row = row_of(port, noise, PEER, [peer], second)
+        rows.append(
+            {**row, f"p95_{second}": None, "milliseconds": peer_ms, "lost": None}
+        )
+    return rows
+
+
+def row_of(
+    port: str, noise: float, method: str, runs: Sequence[Sequence[float]], second: str
+) -> Row:
+    """Medians over runs of (rotation, position or direction[, milliseconds])."""
+    table = np.array(runs, dtype=float)
+    return {
+        "port": port,
+        "noise_px": noise,
+        "method": method,
+        "rotation_deg": float(np.median(table[:, 0])),
+        second: float(np.median(table[:, 1])),
+        f"p95_{second}": float(np.percentile(table[:, 1], 95.0)),
+        "milliseconds": f"{np.median(table[:, 2]):.1f}" if table.shape[1] > 2 else None,
+        "lost": int(np.count_nonzero(~np.isfinite(table[:, 0]))),
+    }
+
+
+def page(
+    absolute: Sequence[Row], relative: Sequence[Row], options: argparse.Namespace
+) -> str:
+    common = {
+        "port": ("port", ""),
+        "noise_px": ("noise, px", ".1f"),
+        "method": ("method", ""),
+        "rotation_deg": ("rotation, deg", ".2g"),
+    }
+    end = {"milliseconds": ("CPU, ms", ""), "lost": ("no pose", "d")}
+    position = {
+        "position_mm": ("position, mm", ".3g"),
+        "p95_position_mm": ("95 %", ".3g"),
+    }
+    direction = {
+        "direction_deg": ("direction, deg", ".2g"),
+        "p95_direction_deg": ("95 %", ".2g"),
+    }
+    return "\n\n".join(
+        [
+            HEADER,
+            f"## Absolute pose: medians of {options.absolute} runs",
+            markdown(absolute, {**common, **position, **end}),
+            f"## Relative pose: medians of {options.relative} runs",
+            markdown(relative, {**common, **direction, **end}) + "\n",
+        ]
+    )
+
+
+HEADER = """# Poses from matches
+
+Made by `pipelines/rsfm/poses.py`; see [README.md](../README.md) for what is what."""
+
+
+if __name__ == "__main__":
+    main()
