@@ -11,8 +11,9 @@ from sfm_scenes import same_frame_matches, simulated_dive
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
+from uwsfm.models.port import DomePort
 from uwsfm.rig import Rig
-from uwsfm.sfm.rig_check import check_rig, check_rotation
+from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
@@ -54,6 +55,26 @@ def refusal(rig: Rig, poses: np.ndarray, pair: PairMatches) -> str:
 
 def test_a_right_rig_passes_though_its_ports_are_tilted(rig, pair):
     check_rig(rig, poses_of(rig), [pair])
+
+
+def test_a_right_rig_passes_though_its_domes_are_off_their_centres():
+    """By 8 mm, one towards the water and one away: their images differ in size."""
+    offsets = (0.004, -0.003, 0.008), (-0.003, 0.002, -0.008)
+    rig, known = (
+        replace(
+            sample_rig(),
+            cameras=tuple(
+                replace(item, port=DomePort(center=center), refine_center=True)
+                for item, center in zip(sample_rig().cameras, centers, strict=True)
+            ),
+        )
+        for centers in (offsets, ((0.0, 0.0, 0.0),) * 2)
+    )
+    pair = same_frame_matches(simulated_dive(rig).scene)
+    check_rig(known, poses_of(known), [pair])
+    rotation = turned(known, poses_of(known), pair)
+    check_rotation(known, rotation, [pair])
+    assert rotation.turn_deg.max() > MAX_TURN_DEG  # what a flat port would not pass
 
 
 def test_swapped_images_are_recognised(rig, pair):

@@ -82,9 +82,14 @@ def check_rotation(
 ) -> None:
     """Refuse a rig that needs more than tilted ports could explain.
 
+    A dome off its centre scales the image, which turns make up for badly and by much:
+    where a centre is to be refined, nothing is refused.
+
     Raises:
         InputError: names the camera.
     """
+    if any(item.refine_center for item in rig.cameras):
+        return
     worst = int(rotation.turn_deg.argmax())
     if rotation.turn_deg[worst] > MAX_TURN_DEG:
         raise InputError(
