@@ -154,7 +154,7 @@ def test_names_are_printed_as_they_are(capsys):
         "distance_stddev_m": None,
         "distance_verdict": "held",
     }
-    console.print(housing_table({"cameras": [camera]}))
+    console.print(housing_table({"cameras": [camera], "scale": {"small_unit": "mm"}}))
     assert "[/x]" in capsys.readouterr().out
 
 

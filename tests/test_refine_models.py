@@ -24,7 +24,7 @@ from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
-from uwsfm.simulate.trajectories import rich_motion, straight_strip
+from uwsfm.simulate.trajectories import straight_strip
 
 
 @pytest.fixture(scope="module")
@@ -129,35 +129,6 @@ def test_a_single_camera_is_refined_up_to_its_scale(dive, tmp_path):
     # Found: 0.10 % and 2.5 %. The shape is right, and no length in it is known.
     assert spread["refined"] < 0.1 * spread["pinhole"]
     assert spread["refined"] < 2e-3
-
-
-def test_domes_off_their_centres_are_found(tmp_path):
-    """By millimetres: each scales its image, which no turn of a camera makes up for."""
-    offsets = (0.004, -0.003, 0.006), (-0.003, 0.002, -0.005)
-    stereo = sample_rig()
-    rig, known = (
-        replace(
-            stereo,
-            cameras=tuple(
-                replace(item, port=uwsfm.DomePort(center=center), refine_center=True)
-                for item, center in zip(stereo.cameras, centers, strict=True)
-            ),
-        )
-        for centers in (offsets, ((0.0, 0.0, 0.0),) * 2)
-    )
-    options = ObservationOptions(num_points=400, noise_px=0.3, outlier_ratio=0.02)
-    dive = simulate_scene(rig, rich_motion(NUM_FRAMES), Relief(stddev=0.2), options)
-    model = model_of(known, dive.scene)
-    write(moved(self_calibrated(model), 3.0), tmp_path / "model", old=True)
-    result = uwsfm.refine_model(tmp_path / "model", known, tmp_path / "out")
-    for port, center, stddev in zip(
-        result.model.scene.ports,
-        offsets,
-        result.calibration.covariance.cameras,
-        strict=True,
-    ):
-        gap = np.abs(np.subtract(port.center, center))
-        assert np.all(gap < 4.0 * np.array(stddev.center_stddev_m))
 
 
 def test_what_a_start_is_too_far_off_for_comes_back(tmp_path):

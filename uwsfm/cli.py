@@ -62,6 +62,31 @@ PriorOption = Annotated[
 ]
 
 
+PositionsOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Positions of the frames (navigation, GPS): CSV with the header "
+        "frame,x,y,z,sx,sy,sz in metres, in a local right-handed frame.",
+        show_default=False,
+    ),
+]
+LeverArmOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="The antenna of the positions in the frame of the first camera, metres.",
+        show_default=False,
+    ),
+]
+LengthsOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Scale bars and distances between frames: a YAML file, see the README.",
+        show_default=False,
+    ),
+]
+
+
 @app.callback()
 def _global_options(
     verbose: Annotated[
@@ -134,6 +159,9 @@ def reconstruct(
         Literal["pinhole", "refractive"],
         typer.Option(help="refractive: water rays in every step, not only the last."),
     ] = "pinhole",
+    positions: PositionsOption = None,
+    lever_arm: LeverArmOption = None,
+    lengths: LengthsOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
@@ -154,6 +182,9 @@ def reconstruct(
             matching=matching,
             matcher=matcher,
             mapper=mapper,
+            positions=positions,
+            lever_arm=_lever_arm(lever_arm),
+            lengths=lengths,
             seed=seed,
             num_threads=threads,
             progress=progress,
@@ -239,6 +270,9 @@ def refine(
         Path | None,
         typer.Option(help="Folder of the cameras' folders, for the points' colours."),
     ] = None,
+    positions: PositionsOption = None,
+    lever_arm: LeverArmOption = None,
+    lengths: LengthsOption = None,
     database: Annotated[
         Path | None,
         typer.Option(help="COLMAP's database: more matches, frames that it lost."),
@@ -266,6 +300,9 @@ def refine(
             rig,
             out,
             images=images,
+            positions=positions,
+            lever_arm=_lever_arm(lever_arm),
+            lengths=lengths,
             database=database,
             scene_distance_m=scene_distance,
             progress=progress,
@@ -274,6 +311,18 @@ def refine(
         )
     _print_result(result.summary)
     typer.echo(f"results in {out}")
+
+
+def _lever_arm(text: str | None) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3:
+        raise InputError(f"--lever-arm {text}: write three numbers X,Y,Z in metres")
+    return values
 
 
 def _wanted(what: Iterable[Refinable]) -> dict[str, bool]:

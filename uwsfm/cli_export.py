@@ -33,7 +33,7 @@ def export(
     ] = None,
 ) -> None:
     """Write a reconstruction for other programs."""
-    from uwsfm.export.files import read_model
+    from uwsfm.export.files import read_model, unit_of_model
 
     if images is not None and to != "pinhole":
         raise InputError(f"--images: --to {to} writes no images")
@@ -47,7 +47,7 @@ def export(
     else:
         from uwsfm.export.scene_ply import export_scene_ply
 
-        export_scene_ply(found, out)
+        export_scene_ply(found, out, unit=unit_of_model(model))
     typer.echo(f"wrote {out}")
 
 

@@ -70,16 +70,16 @@ def housing_table(summary: dict[str, Any]) -> Table:
     """The refined housings, each number with its standard deviation."""
     table = Table(title="Housing: ± is one standard deviation", title_justify="left")
     table.add_column("camera", no_wrap=True)
-    table.add_column("port", no_wrap=True)
+    table.add_column("port")
     for column in ("estimate", "±", "by the images"):
         table.add_column(column, justify="right", no_wrap=True)
     for camera in summary["cameras"]:
-        for row in _port_rows(camera):
+        for row in _port_rows(camera, summary["scale"]["small_unit"]):
             table.add_row(Text(camera["name"]), *row)
     return table
 
 
-def _port_rows(camera: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, str, str, str]]:
     """What, estimate, standard deviation and verdict of what a port has."""
     if camera["port"] == "none":
         return [("none", "", "", "")]
@@ -87,7 +87,7 @@ def _port_rows(camera: dict[str, Any]) -> list[tuple[str, str, str, str]]:
         known = camera["center_stddev_m"]
         return [
             (
-                "dome centre (mm)",
+                f"dome centre ({unit})",
                 _millimetres(camera["center_m"]),
                 "-" if None in known else _millimetres(known),
                 camera["center_verdict"],
@@ -101,7 +101,7 @@ def _port_rows(camera: dict[str, Any]) -> list[tuple[str, str, str, str]]:
             camera["normal_verdict"],
         ),
         (
-            "distance (mm)",
+            f"distance ({unit})",
             f"{1e3 * camera['distance_m']:.2f}",
             _number(camera["distance_stddev_m"], "{:.2f}", 1e3),
             camera["distance_verdict"],
@@ -120,6 +120,8 @@ def result_table(summary: dict[str, Any]) -> Table:
     table.add_row("invalid observations", f"{summary['num_invalid']}")
     table.add_row("true reprojection RMS before", f"{rms['before']:.3f} px")
     table.add_row("true reprojection RMS after", f"{rms['after']:.3f} px")
+    table.add_row("scale", _scale(summary["scale"]))
+    _add_positions(table, summary.get("positions"))
     if "colmap_model" in summary:
         found = summary["colmap_model"]
         own, ours = (
@@ -145,6 +147,7 @@ def calibration_table(summary: dict[str, Any]) -> Table:
     table.add_row("observations", f"{summary['num_observations']}")
     rms = summary["reprojection_rms_px"]
     table.add_row("true reprojection RMS", f"{rms:.3f} px")
+    table.add_row("scale", _scale(summary["scale"]))
     _add_refined(table, summary["refined"])
     return table
 
@@ -156,8 +159,8 @@ def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
 
 
 _SHIFTS: dict[str, tuple[str, ...]] = {
-    "flat": ("tilt (deg)", "distance (mm)"),
-    "dome": ("centre x, y, z (mm)",),
+    "flat": ("tilt (deg)", "distance ({})"),
+    "dome": ("centre x, y, z ({})",),
     "none": (),
 }
 
@@ -172,7 +175,8 @@ def budget_table(summary: dict[str, Any]) -> Table:
     for camera in summary["cameras"]:
         name = camera["name"]
         for what in _SHIFTS[camera["port"]]:
-            table.add_column(f"{name}\n{what}", justify="right")
+            text = what.format(summary["scale"]["small_unit"])
+            table.add_column(f"{name}\n{text}", justify="right")
     for row in summary["error_budget"]:
         cells = []
         sign = "" if row is summary["error_budget"][-1] else "+"
@@ -260,6 +264,23 @@ def timings_table(timings: dict[str, float]) -> Table:
         table.add_row(step, f"{seconds:.1f} s", f"{share:.0%}")
     table.add_row("total", f"{total:.1f} s", "")
     return table
+
+
+def _scale(scale: dict[str, Any]) -> str:
+    """The verdict, and the standard deviation if there is one."""
+    stddev = scale["relative_stddev"]
+    return scale["verdict"] + ("" if stddev is None else f", ± {1e2 * stddev:.2g} %")
+
+
+def _add_positions(table: Table, positions: dict[str, Any] | None) -> None:
+    if positions is None:
+        return
+    used = positions["num_positions"] - len(positions["outliers"])
+    table.add_row("positions used", f"{used} of {positions['num_positions']}")
+    table.add_row("they miss the model by", f"{positions['rms_miss_m']:.3g} m RMS")
+    place = ", ".join(f"{value:.2g}" for value in positions["place_stddev_m"])
+    turn = positions["turn_stddev_deg"]
+    table.add_row("± of the model's place", f"{place} m; its turn {turn:.2g} deg")
 
 
 def _tilt(normal: list[float] | tuple[float, ...]) -> str:

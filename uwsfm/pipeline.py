@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.observability import verdicts
@@ -24,7 +25,15 @@ from uwsfm.export.files import (
     export_ply,
 )
 from uwsfm.export.housing import export_housing
-from uwsfm.export.summary import errors_summary, housing_summary, versions, write_json
+from uwsfm.export.summary import (
+    errors_summary,
+    housing_summary,
+    outside_summary,
+    scale_summary,
+    versions,
+    write_json,
+)
+from uwsfm.known_lengths import KnownLengths
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
@@ -71,6 +80,9 @@ def reconstruct(
     matching: Matching = "auto",
     matcher: Matcher = "colmap",
     mapper: Mapper = "pinhole",
+    positions: str | Path | None = None,
+    lever_arm: ArrayLike | None = None,
+    lengths: str | Path | None = None,
     seed: int = 0,
     num_threads: int = -1,
     progress: Progress = silent,
@@ -92,6 +104,10 @@ def reconstruct(
         matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
         mapper: "pinhole": COLMAP's, with pinholes fitted to the ports; "refractive":
             water rays in every step, where pinholes do not get far.
+        positions: CSV of positions of the frames, see `uwsfm.lengths_file`; the result
+            is in their frame.
+        lever_arm: (3,) of the antenna they are of, in the rig, metres.
+        lengths: YAML file of scale bars and distances between frames, see there.
         seed: Of all random choices.
         num_threads: -1 for all cores.
         progress: Called with each long step.
@@ -110,25 +126,35 @@ def reconstruct(
         seed=seed,
         num_threads=num_threads,
     )
-    find_frames(Path(images), rig)  # wrong folders fail before anything is written
+    # Wrong folders and files fail before anything is written.
+    frames = find_frames(Path(images), rig)
+    known = KnownLengths.read(lengths, positions, lever_arm)
+    known.check_names(rig, frames.names)
     with locked(out):
-        return _reconstruct(rig, Path(images), out, options, progress)
+        return _reconstruct(rig, Path(images), out, options, known, progress)
 
 
 def _reconstruct(
-    rig: Rig, images: Path, out: Path, options: StartOptions, progress: Progress
+    rig: Rig,
+    images: Path,
+    out: Path,
+    options: StartOptions,
+    known: KnownLengths,
+    progress: Progress,
 ) -> ReconstructResult:
     start = perspective_start(rig, images, out / WORK, options, progress)
     timings = dict(start.summary["timings_s"])
     clock = time.perf_counter()
     arrays = start.arrays()
-    refined = refine_scene(start_scene(rig, start, arrays), rig, progress)
+    scene = start_scene(rig, start, arrays)
+    scene, lengths = known.placed(rig, arrays.frame_names, scene)
+    refined = refine_scene(scene, rig, progress, lengths=lengths)
     timings["refractive adjustment"] = time.perf_counter() - clock
     clock = time.perf_counter()
     model = _model(rig, images, arrays, refined, progress)
     export_colmap(model, out / SPARSE)
     export_housing(model.rig, out / HOUSING, refined.calibration)
-    export_ply(model, out / POINTS, refined.calibration.covariance.points)
+    export_points(model, out / POINTS, refined.calibration)
     timings["colours and export"] = time.perf_counter() - clock
     summary = _summary(model, start, refined, timings)
     write_json(summary, out / SUMMARY)
@@ -138,6 +164,12 @@ def _reconstruct(
         summary=summary,
         start=arrays,
     )
+
+
+def export_points(model: Model, path: Path, calibration: CalibrationResult) -> None:
+    """points.ply, with what is known of its lengths."""
+    unit = scale_summary(calibration)["unit"]
+    export_ply(model, path, calibration.covariance.points, unit=unit)
 
 
 def checked_rig(rig: Rig | str | Path) -> Rig:
@@ -248,6 +280,7 @@ def _summary(
         **found,
         "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},
         "cameras": cameras,
+        **outside_summary(refined.calibration, model.frame_names),
         "baseline_m": model.rig.baseline_m,
         "baseline_stddev_m": model.rig.baseline_stddev_m,
         f"{start.kind}_start": mapped,

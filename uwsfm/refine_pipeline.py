@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
@@ -19,19 +19,26 @@ from uwsfm.export.files import (
     SPARSE,
     SUMMARY,
     export_colmap,
-    export_ply,
 )
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
     errors_summary,
     housing_summary,
+    outside_summary,
     refined_summary,
     versions,
     write_json,
 )
 from uwsfm.housing_pipeline import refined_rig, require_effect
+from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
-from uwsfm.pipeline import checked_rig, housing_warnings, locked, output_folder
+from uwsfm.pipeline import (
+    checked_rig,
+    export_points,
+    housing_warnings,
+    locked,
+    output_folder,
+)
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
@@ -79,6 +86,9 @@ def refine_model(
     images: str | Path | None = None,
     database: str | Path | None = None,
     scene_distance_m: float = 1.0,
+    positions: str | Path | None = None,
+    lever_arm: ArrayLike | None = None,
+    lengths: str | Path | None = None,
     progress: Progress = silent,
     **options: Any,
 ) -> RefineResult:
@@ -102,6 +112,7 @@ def refine_model(
             matches, and frames that the model lacks are registered. It is not changed.
         scene_distance_m: Of a single camera's scene, about: without a baseline it sets
             the scale to start with.
+        positions, lever_arm, lengths: As in `reconstruct`.
         progress: Called with each long step.
         **options: Fields of `CalibrateOptions`.
 
@@ -127,12 +138,15 @@ def refine_model(
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images, rig, start)
-    known = None
+    matches, names = None, start.model.frame_names
     if database is not None:
-        known = read_image_database(Path(database), start.model, rig)
+        matches = read_image_database(Path(database), start.model, rig)
+        names = matches.frame_names
+    known = KnownLengths.read(lengths, positions, lever_arm)
+    known.check_names(rig, names)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out):
-        job = _Job(rig, start, known, images, out, progress, timings)
+        job = _Job(rig, start, matches, known, images, out, progress, timings)
         return job.run(options)
 
 
@@ -178,6 +192,7 @@ class _Job:
     rig: Rig
     start: ModelStart
     database: ImageDatabase | None
+    lengths: KnownLengths
     images: Path | None
     out: Path
     progress: Progress
@@ -186,23 +201,21 @@ class _Job:
     def run(self, options: dict[str, Any]) -> RefineResult:
         clock = time.perf_counter()
         tracks = self.start.tracks
-        refined = refine_scene(tracks.scene, self.rig, self.progress, **options)
+        refined = self._refined(tracks, None, options)
         self._require_raw(refined)
         if self.database is not None:
             known = tracks.scene
             tracks = with_database(
                 self.database, refined, tracks.frame_names, self.progress
             )
-            refined = refine_scene(
-                tracks.scene, self.rig, self.progress, known=known, **options
-            )
+            refined = self._refined(tracks, known, options)
         self.timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]
         model, refined = self._model(refined, tracks)
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, refined.calibration)
-        export_ply(model, self.out / POINTS, refined.calibration.covariance.points)
+        export_points(model, self.out / POINTS, refined.calibration)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
         write_json(summary, self.out / SUMMARY)
@@ -212,6 +225,14 @@ class _Job:
             summary=summary,
             start=self.start,
             model_idx=model_idx,
+        )
+
+    def _refined(
+        self, tracks: Tracks, known: Scene | None, options: dict[str, Any]
+    ) -> Refined:
+        scene, lengths = self.lengths.placed(self.rig, tracks.frame_names, tracks.scene)
+        return refine_scene(
+            scene, self.rig, self.progress, known=known, lengths=lengths, **options
         )
 
     def _require_raw(self, refined: Refined) -> None:
@@ -287,28 +308,23 @@ class _Job:
                 f"{' ...' if len(unregistered) > 10 else ''}"
             )
         both = model_idx >= 0
-        own = _mean(self.start.model.own_error_px[model_idx[both]])
-        error = _mean(model.errors_px()[both])
-        if own is not None and error is not None and error > CLEARLY_WORSE * own:
-            notes.append(
-                f"the cameras of the COLMAP model fit the same observations better "
-                f"({own:.2f} px) than lenses behind ports ({error:.2f} px): are the "
-                "lenses of the rig file those of the air, and its ports of that kind?"
-            )
+        own = self.start.model.own_error_px[model_idx[both]]
+        error = model.errors_px()[both]
         return {
             "num_frames": len(names),
             "unregistered_frames": unregistered,
             **found,
             "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},
             "cameras": housing_summary(model.rig, refined.calibration),
+            **outside_summary(refined.calibration, model.frame_names),
             "refined": refined_summary(model.rig, refined.calibration),
             "baseline_m": model.rig.baseline_m,
             "baseline_stddev_m": model.rig.baseline_stddev_m,
             "colmap_model": {
                 **self.start.summary,
                 "num_common_observations": int(np.count_nonzero(both)),
-                "mean_error_of_common_px": own,
-                "refractive_error_of_common_px": error,
+                "mean_error_of_common_px": _mean(own),
+                "refractive_error_of_common_px": _mean(error),
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
             "timings_s": self.timings,
@@ -333,5 +349,11 @@ def _without_empty_frames(refined: Refined) -> tuple[Refined, NDArray[np.int64]]
     covariance = replace(
         calibration.covariance, frames=calibration.covariance.frames[frames]
     )
-    calibration = replace(calibration, scene=smaller, covariance=covariance)
+    positions = calibration.positions
+    calibration = replace(
+        calibration,
+        scene=smaller,
+        covariance=covariance,
+        positions=None if positions is None else positions.in_frames(frames),
+    )
     return replace(refined, scene=smaller, calibration=calibration), frames

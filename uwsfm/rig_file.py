@@ -24,7 +24,13 @@ from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
 from uwsfm.models.port import DomePort, NoPort
 from uwsfm.rig import Rig, RigCamera
-from uwsfm.rig_schema import ENTRIES, CameraEntry, RadialUndistortionLens, RigFile
+from uwsfm.rig_schema import (
+    ENTRIES,
+    CameraEntry,
+    Entry,
+    RadialUndistortionLens,
+    RigFile,
+)
 from uwsfm.rig_values import checked_baseline
 
 # ---- Reading ------------------------------------------------------------------------
@@ -58,14 +64,14 @@ def load_rig(path: str | Path) -> Rig:
         InputError: one sentence with the file, the key path and what is wrong.
     """
     try:
-        return _to_rig(RigFile.model_validate(_read_yaml(Path(path))))
+        return _to_rig(RigFile.model_validate(read_yaml(Path(path))))
     except ValidationError as error:
-        raise InputError(f"{path}: {_first_problem(error)}") from None
+        raise InputError(f"{path}: {first_problem(error)}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _read_yaml(path: Path) -> dict:
+def read_yaml(path: Path) -> dict:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -153,12 +159,19 @@ def _placement_problem(entry: CameraEntry, i: int, num_cameras: int) -> str:
     return ""
 
 
-def _first_problem(error: ValidationError) -> str:
-    """The key path and sentence of the first problem, and how many others there are."""
+def first_problem(
+    error: ValidationError, entries: Mapping[str, type[Entry]] = ENTRIES
+) -> str:
+    """The key path and sentence of the first problem, and how many others there are.
+
+    Args:
+        error: what pydantic found.
+        entries: the blocks of the file by the keys they are under, for what was meant.
+    """
     problems = error.errors(include_url=False)
     unknown = [p for p in problems if p["type"] in _UNKNOWN_KEY]
     # A misspelt key is one mistake, not an unknown key and a missing one.
-    meant = {(*p["loc"][:-1], _meant_key(p["loc"])) for p in unknown}
+    meant = {(*p["loc"][:-1], _meant_key(p["loc"], entries)) for p in unknown}
     doubled = [p for p in problems if p["type"] == "missing" and p["loc"] in meant]
     rest = [p for p in problems if not any(p is q for q in [*unknown, *doubled])]
     first, *others = [*unknown, *rest]
@@ -168,7 +181,7 @@ def _first_problem(error: ValidationError) -> str:
             key_path += f"[{part}]"
         elif not part.startswith("("):
             key_path += f".{part}"
-    sentence = f"{key_path.lstrip('.')}: {_sentence(first)}"
+    sentence = f"{key_path.lstrip('.')}: {_sentence(first, entries)}"
     if others:
         plural = "s" if len(others) > 1 else ""
         sentence += f" (and {len(others)} more problem{plural} in this file)"
@@ -190,12 +203,12 @@ _WANTED = {
 }
 
 
-def _sentence(problem: Any) -> str:
+def _sentence(problem: Any, entries: Mapping[str, type[Entry]]) -> str:
     kind, value, context = problem["type"], problem["input"], problem.get("ctx", {})
     if kind == "missing":
         return "this key is missing"
     if kind in _UNKNOWN_KEY:
-        return _unknown_key(problem["loc"])
+        return _unknown_key(problem["loc"], entries)
     if kind == "value_error":
         return str(context["error"])
     if kind in ("too_short", "too_long"):
@@ -212,24 +225,28 @@ _UNIT = re.compile(
 )
 
 
-def _meant_key(loc: tuple[int | str, ...]) -> str | None:
+def _meant_key(
+    loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]
+) -> str | None:
     """The known key nearest to an unknown one: another unit, or a slip of the pen."""
-    known, key = _known_keys(loc), str(loc[-1]).lower()
+    known, key = _known_keys(loc, entries), str(loc[-1]).lower()
     stem = _UNIT.sub("", key)
     close = [k for k in known if _UNIT.sub("", k) == stem]
     close += difflib.get_close_matches(key, known, n=1)
     return close[0] if close else None
 
 
-def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
+def _known_keys(
+    loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]
+) -> list[str]:
     parents = [part for part in loc[:-1] if isinstance(part, str)]
-    return list(ENTRIES[parents[-1] if parents else ""].model_fields)
+    return list(entries[parents[-1] if parents else ""].model_fields)
 
 
-def _unknown_key(loc: tuple[int | str, ...]) -> str:
-    meant = _meant_key(loc)
+def _unknown_key(loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]) -> str:
+    meant = _meant_key(loc, entries)
     if meant is None:
-        return f"unknown key; the keys here are {', '.join(_known_keys(loc))}"
+        return f"unknown key; the keys here are {', '.join(_known_keys(loc, entries))}"
     unit = {"_m": " (in metres)", "_px": " (in pixels)", "_xyzw": " (w last)"}
     suffix = next((text for end, text in unit.items() if meant.endswith(end)), "")
     return f"unknown key, did you mean {meant}{suffix}?"

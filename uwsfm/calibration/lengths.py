@@ -4,7 +4,7 @@ One camera has no baseline: its images leave the scale open. A scale bar, a know
 distance between two frames, or navigation gives it. Rigs with a baseline gain too.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -131,7 +131,27 @@ class Lengths:
     positions: Positions | None = None
     clicked: IndexArray = field(default_factory=_no_indices)
     """Observations that are never taken for outliers: the ends of scale bars, which
-    people clicked."""
+    people clicked. They are the last of the scene, and so are their points."""
+    click_stddevs_px: Array | None = None
+    """(M,) noise of the clicks on each scale bar; None: their ends are features."""
+
+    def in_part(self, keep: NDArray[np.bool_], used: IndexArray) -> "Lengths":
+        """These lengths for a part of the scene, as `Scene.select` makes it.
+
+        Args:
+            keep: (N,) observations that are in the part; clicked ones are.
+            used: (P',) old index of each of its points.
+        """
+        bars = self.between_points
+        if bars is not None:
+            if not np.all(np.isin(bars.ends, used)):
+                row = int(np.argmax(~np.isin(bars.ends, used).all(axis=1)))
+                raise InputError(
+                    f"scale bar {row + 1}: an end is not seen well enough to be placed"
+                )
+            bars = replace(bars, ends=np.searchsorted(used, bars.ends))
+        clicked = np.cumsum(keep)[self.clicked] - 1
+        return replace(self, between_points=bars, clicked=clicked)
 
     def checked(self, scene: Scene) -> "Lengths":
         """These lengths, if a scene has what they speak of.
@@ -171,7 +191,7 @@ class LengthFit:
     given_m: Array
     """(M,) scale bars, then distances between frames."""
     stddevs_m: Array
-    """(M,) as given."""
+    """(M,) with those of clicked ends."""
     found_m: Array
     """(M,) in the adjusted scene."""
 
@@ -192,6 +212,16 @@ class PositionFit:
     covariance: Array
     """(6, 6) of the model's place in the frame of the positions: rotation (radians)
     about the middle of the positions, and translation (metres) of that middle."""
+
+    def in_frames(self, frames: IndexArray) -> "PositionFit":
+        """The fit of some frames (F',), numbered as they are there."""
+        there = np.isin(self.frame_idx, frames)
+        return replace(
+            self,
+            frame_idx=np.searchsorted(frames, self.frame_idx[there]),
+            misses_m=self.misses_m[there],
+            inliers=self.inliers[there],
+        )
 
     @property
     def num_outliers(self) -> int:

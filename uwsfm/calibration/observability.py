@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.length_verdicts import length_verdicts, small_unit
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -124,15 +125,18 @@ def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]
         for name, camera in zip(names, covariance.cameras, strict=True)
         if camera.distance_at_zero
     )
+    about_lengths = length_verdicts(result)
     if not covariance.determined:
         reason, advice = geometry.reason()
         return (
+            *about_lengths,
             *at_zero,
             "the images leave some combination of what is refined entirely free, so no "
             f"standard deviation can be given; {reason} do not tell: {advice}, or hold "
             "more of it",
         )
     return (
+        *about_lengths,
         *at_zero,
         *_distances(result, names, geometry),
         *_tilts(result, names),
@@ -158,6 +162,7 @@ def _distances(
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
     ports = [result.scene.ports[c] for c in free]
     typical = float(np.mean([p.distance for p in ports if isinstance(p, FlatPort)]))
+    unit = small_unit(covariance.scale_stddev)
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         # Of one distance, not of the unit vector that several share.
@@ -169,8 +174,8 @@ def _distances(
         reason, advice = geometry.reason()
         what = _direction(vector, [names[int(c)] for c in free])
         sentences.append(
-            f"{what} is {word} by {reason}: standard deviation {1e3 * stddev:.1f} mm; "
-            f"{advice}"
+            f"{what} is {word} by {reason}: standard deviation {1e3 * stddev:.1f} "
+            f"{unit}; {advice}"
         )
     return sentences
 
@@ -208,6 +213,7 @@ def _tilts(result: CalibrationResult, names: Sequence[str]) -> list[str]:
 
 
 def _centers(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+    unit = small_unit(result.covariance.scale_stddev)
     sentences = []
     for c, camera in enumerate(result.covariance.cameras):
         port = result.scene.ports[c]
@@ -219,8 +225,8 @@ def _centers(result: CalibrationResult, names: Sequence[str]) -> list[str]:
             x, y, z = (1e3 * value for value in camera.center_stddev_m)
             sentences.append(
                 f"the centre of the dome of {names[c]} is {word}: standard deviation "
-                f"{x:.1f}, {y:.1f}, {z:.1f} mm; hold it if it was measured better, or "
-                "add nearer points and more frames"
+                f"{x:.1f}, {y:.1f}, {z:.1f} {unit}; hold it if it was measured better, "
+                "or add nearer points and more frames"
             )
     return sentences
 

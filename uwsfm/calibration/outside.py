@@ -42,8 +42,33 @@ def start_scale(scene: Scene, lengths: Lengths) -> float:
     if lengths.between_frames is not None:
         return _ratio(origins, lengths.between_frames)
     if lengths.positions is not None:
-        return _alignment(scene, lengths, with_scale=True).scale
+        seen = with_seen_positions(lengths, scene)
+        return _alignment(scene, seen, with_scale=True).scale
     return 1.0
+
+
+def with_seen_positions(lengths: Lengths, scene: Scene) -> Lengths:
+    """Lengths with the positions of frames that have observations.
+
+    Raises:
+        InputError: these are too few.
+    """
+    known = lengths.positions
+    if known is None:
+        return lengths
+    seen = np.isin(known.frame_idx, scene.frame_idx)
+    if len(np.unique(known.frame_idx[seen])) < 3:
+        raise InputError(
+            f"{np.count_nonzero(seen)} of the positions belong to frames of the model: "
+            "at least 3 different frames are needed"
+        )
+    known = replace(
+        known,
+        frame_idx=known.frame_idx[seen],
+        positions=known.positions[seen],
+        covariances=known.covariances[seen],
+    )
+    return replace(lengths, positions=known)
 
 
 def _ratio(places: Array, distances: Distances) -> float:
@@ -82,25 +107,13 @@ class Outside:
         Raises:
             InputError: it does not have it, or too little.
         """
-        lengths = lengths.checked(scene)
+        lengths = with_seen_positions(lengths.checked(scene), scene)
         observed = np.unique(scene.frame_idx)
         known = lengths.positions
         if known is not None:
-            seen = np.isin(known.frame_idx, observed)
-            if len(np.unique(known.frame_idx[seen])) < 3:
-                raise InputError(
-                    f"{np.count_nonzero(seen)} of the positions belong to frames of "
-                    "the model: at least 3 different frames are needed"
-                )
-            known = replace(
-                known,
-                frame_idx=known.frame_idx[seen],
-                positions=known.positions[seen],
-                covariances=known.covariances[seen],
-            )
-            lengths = replace(lengths, positions=known)
             self.middle: Array = np.median(known.positions, axis=0)
             self.inliers = np.ones(len(known.positions), dtype=bool)
+            self.present = self.inliers
         self.lengths = lengths
         self.one_camera = len(scene.cameras) == 1
         self.hold_scale = self.one_camera and not lengths.give_scale
@@ -241,7 +254,8 @@ class Outside:
     def _position_term(self, frames: IndexArray, sigma_px: float) -> PositionTerm:
         known = self.lengths.positions
         assert known is not None
-        keep = self.inliers & np.isin(known.frame_idx, frames)
+        self.present = np.isin(known.frame_idx, frames)
+        keep = self.inliers & self.present
         roots = np.linalg.inv(np.linalg.cholesky(known.covariances[keep]))
         return PositionTerm(
             frames=known.frame_idx[keep],
@@ -277,8 +291,9 @@ class Outside:
         if not self.navigation:
             return False
         before = (self.robust, self.scatter, self.inliers)
-        squares = self.squares(state)
-        spread = max(1.0, float(np.median(squares)) / MEDIAN_CHI2_3)
+        squares = np.where(self.present, self.squares(state), np.inf)
+        middle = float(np.median(squares[self.present]))
+        spread = max(1.0, middle / MEDIAN_CHI2_3)
         near = squares <= LIMIT_CHI2_3 * spread
         count = 3 * int(np.count_nonzero(near))
         variance = float(np.sum(squares[near])) / max(count - 6, 1)

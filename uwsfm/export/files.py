@@ -1,5 +1,6 @@
 """What a reconstruction leaves on disk, and how it is read back."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,15 @@ def checked_target(path: str | Path) -> Path:
     return target
 
 
+def unit_of_model(folder: str | Path) -> str:
+    """What the lengths of a result are in, by its summary; "metre" without one."""
+    try:
+        text = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
+        return str(json.loads(text)["scale"]["unit"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "metre"
+
+
 def export_colmap(model: Model, folder: str | Path) -> None:
     """Write a COLMAP binary model: cameras, rigs, frames, images, points3D."""
     reconstruction = to_reconstruction(model)
@@ -58,7 +68,11 @@ def export_colmap(model: Model, folder: str | Path) -> None:
 
 
 def export_ply(
-    model: Model, path: str | Path, points_cov: ArrayLike | None = None
+    model: Model,
+    path: str | Path,
+    points_cov: ArrayLike | None = None,
+    *,
+    unit: str = "metre",
 ) -> None:
     """Write the points as a binary PLY.
 
@@ -69,6 +83,7 @@ def export_ply(
         model: what to write.
         path: the file.
         points_cov: (P, 3, 3) covariances; without them there is no depth_stddev_m.
+        unit: of lengths, for the comment in the file.
     """
     scene = model.scene
     fields: list[tuple[str, str]] = [(axis, "<f4") for axis in "xyz"]
@@ -89,7 +104,7 @@ def export_ply(
         rows["depth_stddev_m"] = depth_stddev(model, np.asarray(points_cov, float))
     kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
     header = ["ply", "format binary_little_endian 1.0"]
-    header += ["comment metres; made by uwsfm", f"element vertex {len(rows)}"]
+    header += [f"comment unit: {unit}; made by uwsfm", f"element vertex {len(rows)}"]
     header += [f"property {kinds[kind]} {name}" for name, kind in fields]
     with replaced_file(Path(path)) as partial:
         partial.write_bytes(

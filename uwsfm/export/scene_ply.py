@@ -42,7 +42,7 @@ class Lines:
     """(V, 3) RGB"""
 
 
-def export_scene_ply(model: Model, path: str | Path) -> None:
+def export_scene_ply(model: Model, path: str | Path, *, unit: str = "metre") -> None:
     """Write points, frusta and port outlines as one binary PLY with edges.
 
     Vertices: x y z (float, metres, world), red green blue (uchar), the points first.
@@ -51,6 +51,7 @@ def export_scene_ply(model: Model, path: str | Path) -> None:
     Args:
         model: what to write.
         path: the file; must not exist.
+        unit: of lengths, for the comment in the file.
 
     Raises:
         InputError: the file exists or cannot be written.
@@ -75,7 +76,7 @@ def export_scene_ply(model: Model, path: str | Path) -> None:
             edges.append(lines.edges + count)
             edge_colors.append(lines.colors[lines.edges[:, 1]])
             count += len(lines.vertices)
-    _write(target, vertices, colors, edges, edge_colors)
+    _write(target, unit, vertices, colors, edges, edge_colors)
 
 
 def camera_lines(
@@ -134,6 +135,7 @@ def _joined(lines: list[Array], colors: list[NDArray[np.uint8]]) -> Lines:
 
 def _write(
     path: Path,
+    unit: str,
     vertices: list[Array],
     colors: list[NDArray[np.uint8]],
     edges: list[IndexArray],
@@ -143,7 +145,7 @@ def _write(
     rows = _rows([(axis, "<f4") for axis in "xyz"] + rgb, vertices, colors)
     lines = _rows([("vertex1", "<i4"), ("vertex2", "<i4"), *rgb], edges, edge_colors)
     kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
-    header = ["ply", "format binary_little_endian 1.0", "comment metres; uwsfm"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment unit: {unit}; uwsfm"]
     for element, table in (("vertex", rows), ("edge", lines)):
         header.append(f"element {element} {len(table)}")
         for name in table.dtype.names or ():

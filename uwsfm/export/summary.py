@@ -12,6 +12,8 @@ import numpy as np
 
 from uwsfm._files import replaced_file
 from uwsfm.calibration.error_budget import BudgetRow
+from uwsfm.calibration.length_verdicts import scale_verdict, small_unit
+from uwsfm.calibration.lengths import LengthFit, PositionFit
 from uwsfm.calibration.observability import (
     center_verdict,
     distance_verdict,
@@ -123,6 +125,57 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
         "solver_iterations": summary.num_iterations,
         "solver_converged": summary.converged,
         "housing_determined": calibration.covariance.determined,
+        "scale": scale_summary(calibration),
+    }
+
+
+def scale_summary(calibration: CalibrationResult) -> dict[str, Any]:
+    """Whether the lengths of a result are metres, and how well their scale is known."""
+    stddev = calibration.covariance.scale_stddev
+    return {
+        "verdict": scale_verdict(stddev),
+        "relative_stddev": _stddev(math.nan if stddev is None else stddev, True),
+        "unit": "scale arbitrary" if stddev is None else "metre",
+        "small_unit": small_unit(stddev),
+    }
+
+
+def outside_summary(
+    calibration: CalibrationResult, frame_names: Sequence[str]
+) -> dict[str, Any]:
+    """What came of lengths and positions from outside; null if none were given."""
+    return {
+        "known_lengths": _lengths_summary(calibration.lengths),
+        "positions": _positions_summary(calibration.positions, frame_names),
+    }
+
+
+def _lengths_summary(fit: LengthFit | None) -> list[dict[str, float]] | None:
+    if fit is None:
+        return None
+    columns = zip(fit.given_m, fit.stddevs_m, fit.found_m, strict=True)
+    return [
+        {"given_m": float(given), "stddev_m": float(stddev), "found_m": float(found)}
+        for given, stddev, found in columns
+    ]
+
+
+def _positions_summary(
+    fit: PositionFit | None, frame_names: Sequence[str]
+) -> dict[str, Any] | None:
+    if fit is None:
+        return None
+    miss = np.linalg.norm(fit.misses_m, axis=1)
+    turn, axis = fit.turn
+    place = np.sqrt(np.diag(fit.covariance)[3:])
+    return {
+        "num_positions": len(fit.inliers),
+        "outliers": [frame_names[f] for f in fit.frame_idx[~fit.inliers]],
+        "rms_miss_m": float(np.sqrt(np.mean(miss[fit.inliers] ** 2))),
+        "scatter": fit.scatter,
+        "place_stddev_m": place.tolist(),
+        "turn_stddev_deg": math.degrees(turn),
+        "turn_axis": axis.tolist(),
     }
 
 

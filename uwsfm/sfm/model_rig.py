@@ -118,7 +118,8 @@ def _single_camera(model: ImageModel, scene_distance_m: float) -> ModelRig:
         doubtful=np.zeros(model.registered.shape, dtype=bool),
         warnings=(
             f"one camera has no baseline: lengths of the model were multiplied by "
-            f"{scale:.4g}, so that its points are {scene_distance_m:g} m away (median)",
+            f"{scale:.4g} to start with, which puts its points {scene_distance_m:g} m "
+            "away (median)",
         ),
         summary={"scale_m": scale, "scene_distance_m": scene_distance_m},
     )
@@ -221,15 +222,11 @@ def _scale(
         if pairs.length is not None
     ]
     if not ratios:
-        examples = (
-            f"{item.images}/{model.frame_names[int(np.argmax(there))]}"
-            for item, there in zip(rig.cameras, model.registered, strict=True)
-        )
         raise InputError(
             f"{model.folder}: no frame has a registered image of "
-            f"{rig.cameras[0].name!r} and one of another camera, so that the baseline "
-            "cannot give the model its scale: images of one frame need equal names, "
-            f"the first ones are {' and '.join(examples)}"
+            f"{rig.cameras[0].name!r} and one of another camera under the same name: "
+            "the baseline cannot give the model its scale (images of one frame have "
+            "equal names)"
         )
     if max(ratios) > MAX_SCALE_RATIO * min(ratios):
         raise InputError(
@@ -279,16 +276,11 @@ def _checked_start(
     notes, poses = [], np.asarray(rig.cam_from_rig)
     if enough:
         check_rig(rig, poses, matches)
-        if any(item.refine_center for item in rig.cameras):
-            # A dome off its centre scales the image: no turn makes up for that.
-            if rig.refine_cam_from_rig:
-                poses = metric
-        else:
-            rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
-            check_rotation(rig, rotation, matches)
-            notes = rotation.warnings(rig)
-            if rig.refine_cam_from_rig:
-                poses = rotation.cam_from_rig
+        rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
+        check_rotation(rig, rotation, matches)
+        notes = rotation.warnings(rig)
+        if rig.refine_cam_from_rig:
+            poses = rotation.cam_from_rig
     for pairs in found:
         sentence = _contradiction(pairs, rig)
         if sentence and not enough:

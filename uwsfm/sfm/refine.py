@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
+from uwsfm.calibration.clicks import check_clicks, with_click_noise
+from uwsfm.calibration.lengths import Lengths
+from uwsfm.calibration.outside import scaled, start_scale
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
@@ -54,6 +57,7 @@ def refine_scene(
     progress: Progress = silent,
     *,
     known: Scene | None = None,
+    lengths: Lengths | None = None,
     **options: Any,
 ) -> Refined:
     """Refractive bundle adjustment, twice: the second with all tracks tested again.
@@ -67,13 +71,15 @@ def refine_scene(
         rig: what to refine, and how well the baseline is known.
         progress: called as the solver iterates.
         known: has the cameras and the rig that priors are around; default: ``scene``.
+        lengths: what is known beside the baselines; what was clicked for it is no part
+            of the result.
         **options: further fields of `CalibrateOptions`.
 
     Raises:
         UwsfmError: nothing is left to adjust, or the result is not physical.
     """
     options = {**rig_options(rig), **options}
-    steps = 0
+    given, steps = lengths or Lengths(), 0
 
     def report(iteration: int, cost: float) -> None:
         nonlocal steps
@@ -81,11 +87,18 @@ def refine_scene(
         progress("refractive bundle adjustment", steps, None)
 
     calibrated = within_valid_radius(scene, rig)
-    scene = retriangulated(scene, calibrated)
-    keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
+    calibrated[given.clicked] = True
+    scene = _at_scale(retriangulated(scene, calibrated), given, calibrated)
     start, known = scene, known or scene
-    part, _ = scene.select(_require(keep, scene))
-    first = calibrate(part, known=known, report=report, **options)
+
+    def solve(scene: Scene, keep: NDArray[np.bool_]) -> CalibrationResult:
+        keep[given.clicked] = True
+        part, used = scene.select(_require(keep, scene))
+        inside = with_click_noise(given, scene).in_part(keep, used)
+        return calibrate(part, known=known, lengths=inside, report=report, **options)
+
+    keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
+    first = solve(scene, keep)
     trusted = np.zeros_like(keep)
     trusted[np.nonzero(keep)[0][first.inliers]] = True
     # Points that the start was too far off for get another chance, as a whole.
@@ -93,10 +106,11 @@ def refine_scene(
     trusted |= lost[scene.point_idx] & calibrated
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
-    part, _ = scene.select(_require(keep, scene))
-    second = calibrate(part, known=known, report=report, **options)
-    kept = np.nonzero(keep)[0][second.inliers]
-    final, still = second.scene.select(second.inliers)
+    check_clicks(given, scene)
+    second = solve(scene, keep)
+    found = second.inliers & ~np.isin(np.nonzero(keep)[0], given.clicked)
+    kept = np.nonzero(keep)[0][found]
+    final, still = second.scene.select(found)
     before = start.residuals()[kept]
     return Refined(
         scene=final,
@@ -104,6 +118,14 @@ def refine_scene(
         calibration=_compact(second, final, still),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
     )
+
+
+def _at_scale(scene: Scene, lengths: Lengths, trusted: NDArray[np.bool_]) -> Scene:
+    """The scene of one camera, at the scale of its lengths."""
+    if len(scene.cameras) > 1 or not lengths.give_scale:
+        return scene
+    larger = scaled(scene, start_scale(scene, lengths))
+    return retriangulated(larger, trusted)
 
 
 def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
