@@ -66,6 +66,10 @@ class ProgressBars:
                 self._progress.update(task, completed=done, total=max(done, 1))
 
 
+# Three numbers and their deviations side by side do not fit a narrow terminal.
+_CENTER: tuple[tuple[str, slice], ...] = (("x, y", slice(0, 2)), ("z", slice(2, 3)))
+
+
 def housing_table(summary: dict[str, Any]) -> Table:
     """The refined housings, each number with its standard deviation."""
     table = Table(title="Housing: ± is one standard deviation", title_justify="left")
@@ -84,14 +88,15 @@ def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, str, str, s
     if camera["port"] == "none":
         return [("none", "", "", "")]
     if camera["port"] == "dome":
-        known = camera["center_stddev_m"]
+        center, known = camera["center_m"], camera["center_stddev_m"]
         return [
             (
-                f"dome centre ({unit})",
-                _millimetres(camera["center_m"]),
-                "-" if None in known else _millimetres(known),
+                f"dome centre {axes} ({unit})",
+                _millimetres(center[part]),
+                "-" if None in known else _millimetres(known[part]),
                 camera["center_verdict"],
             )
+            for axes, part in _CENTER
         ]
     return [
         (
@@ -213,13 +218,17 @@ def comparison_table(comparison: Comparison) -> Table:
             f"{1e3 * camera.distance_error_m:+.2f}",
         )
     for dome in comparison.domes:
-        table.add_row(
-            Text(f"{dome.name}: dome centre (mm)"),
-            _millimetres(dome.center_m),
-            _millimetres(dome.center_stddev_m),
-            _millimetres(dome.true_center_m),
-            f"{1e3 * dome.center_error_m:.2f}",
-        )
+        for axes, part in _CENTER:
+            found, true = list(dome.center_m)[part], list(dome.true_center_m)[part]
+            known = list(dome.center_stddev_m)[part]
+            error = math.dist(found, true)
+            table.add_row(
+                Text(f"{dome.name}: centre {axes} (mm)"),
+                _millimetres(found),
+                _millimetres(known),
+                _millimetres(true),
+                f"{1e3 * error:.2f}",
+            )
     registered, given = str(comparison.num_frames), str(comparison.num_true_frames)
     table.add_row("frames", registered, "", given, "")
     refractive, pinhole = comparison.center_rms_m, comparison.pinhole_center_rms_m

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import DomePort, FlatPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
@@ -46,11 +47,19 @@ class RigRotation:
         """What the user should know, one sentence each."""
         return [
             f"camera {camera.name!r} was turned by {turn:.1f} degrees to fit the "
-            "images: its port is tilted by about four times that, or its "
-            "cam_from_rig is wrong"
+            f"images: {_cause(camera.port)}, or its cam_from_rig is wrong"
             for camera, turn in zip(rig.cameras, self.turn_deg, strict=True)
             if turn > NOTABLE_TURN_DEG
         ]
+
+
+def _cause(port: Port) -> str:
+    """What about a port turns the rays."""
+    if isinstance(port, FlatPort):
+        return "its port is tilted by about four times that"
+    if isinstance(port, DomePort):
+        return "its dome is off its centre"
+    return "its lens looks elsewhere"
 
 
 def correct_rotations(

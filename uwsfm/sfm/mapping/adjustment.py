@@ -8,7 +8,7 @@ import numpy as np
 
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.models.port import FLAT, KIND, FlatPort
+from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
@@ -24,6 +24,8 @@ NORMAL_STDDEV_DEG = 10.0
 """Of the start's normals: much weaker than what ten frames tell."""
 MIN_STDDEV_M = 0.01
 """Of the start's port distances; they are good to themselves, or to this."""
+CENTER_SHARE = 0.2
+"""Of a dome's radius: how well its centre is known at the start."""
 LOCAL_FRAMES = 6
 """Adjusted with a new one."""
 GLOBAL_ITERATIONS = 20
@@ -46,19 +48,21 @@ class Housings:
         """What a rig lets the images refine; None: nothing.
 
         The baseline is held: what is known of its length matters at the end only. So is
-        the distance of a single camera's port, which scales with everything else, and
-        the centre of a dome.
+        the place of a single camera's port, which scales with everything else.
         """
-        flat = [c.port for c in rig.cameras if isinstance(c.port, FlatPort)]
-        distance = float(np.mean([port.distance for port in flat])) if flat else 0.0
+        ports = [camera.port for camera in rig.cameras]
+        distances = [port.distance for port in ports if isinstance(port, FlatPort)]
+        radii = [port.radius for port in ports if isinstance(port, DomePort)]
+        distance = float(np.mean(distances)) if distances else 0.0
+        single = {"refine_distances": False, "refine_centers": False}
         settings = CalibrateOptions.parsed(
             {
                 **rig_options(rig),
-                **({"refine_distances": False} if len(rig.cameras) == 1 else {}),
-                "refine_centers": False,
+                **(single if len(rig.cameras) == 1 else {}),
                 "baseline_stddev_m": 0.0,
                 "normal_stddev_deg": NORMAL_STDDEV_DEG,
                 "distance_stddev_m": max(distance, MIN_STDDEV_M),
+                "center_stddev_m": CENTER_SHARE * min(radii) if radii else None,
             }
         )
         housings = cls(settings=settings, known=growing.scene()[0])
