@@ -20,7 +20,7 @@ from test_outside import (
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.cli import _lever_arm
+from uwsfm.cli_options import lever_arm_of
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
@@ -236,7 +236,7 @@ def test_unknown_names_are_refused_before_anything_is_written(mono, tmp_path, rn
     _one_sentence(done, "'0000.png' is not among the images", "'0000.jpg'")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="--lever-arm 1,2: write three numbers"):
-        _lever_arm("1,2")
+        lever_arm_of("1,2")
     with pytest.raises(InputError, match="no effect without positions"):
         KnownLengths.read(None, None, [1.0, 2.0, 3.0])
 

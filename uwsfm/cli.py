@@ -6,14 +6,24 @@ Heavy packages are imported inside the commands, so that `uwsfm --help` is insta
 import io
 import logging
 import sys
-from collections.abc import Iterable
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from uwsfm.cli_export import export, init_from
+from uwsfm.cli_options import (
+    LengthsOption,
+    LeverArmOption,
+    PositionsOption,
+    PriorOption,
+    RefineOption,
+    SceneDistanceOption,
+    lever_arm_of,
+    priors_of,
+    wanted_of,
+)
+from uwsfm.cli_simulate import simulate_app
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -26,65 +36,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-simulate_app = typer.Typer(
-    help="Synthetic dives with known truth.", no_args_is_help=True
-)
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 
 FAILED, WRONG_INPUT = 1, 2
-
-
-class Refinable(str, Enum):
-    """What --refine takes: the fields refine_... of `CalibrateOptions`."""
-
-    WATER_INDEX = "water-index"
-    FOCAL = "focal"
-    PRINCIPAL_POINT = "principal-point"
-    DISTORTION = "distortion"
-
-
-RefineOption = Annotated[
-    list[Refinable] | None,
-    typer.Option(
-        "--refine", help="Refine this too; may be repeated.", show_default=False
-    ),
-]
-PriorOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="KEY=VALUE",
-        help="What is known: distance_stddev_m, normal_stddev_deg, center_stddev_m, "
-        "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
-        "distortion_stddev; may be repeated.",
-        show_default=False,
-    ),
-]
-
-
-PositionsOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Positions of the frames (navigation, GPS): CSV with the header "
-        "frame,x,y,z,sx,sy,sz in metres, in a local right-handed frame.",
-        show_default=False,
-    ),
-]
-LeverArmOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z",
-        help="The antenna of the positions in the frame of the first camera, metres.",
-        show_default=False,
-    ),
-]
-LengthsOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Scale bars and distances between frames: a YAML file, see the README.",
-        show_default=False,
-    ),
-]
 
 
 @app.callback()
@@ -162,6 +117,9 @@ def reconstruct(
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
+    scene_distance: SceneDistanceOption = 1.0,
+    also: RefineOption = None,
+    prior: PriorOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
@@ -183,11 +141,14 @@ def reconstruct(
             matcher=matcher,
             mapper=mapper,
             positions=positions,
-            lever_arm=_lever_arm(lever_arm),
+            lever_arm=lever_arm_of(lever_arm),
             lengths=lengths,
+            scene_distance_m=scene_distance,
             seed=seed,
             num_threads=threads,
             progress=progress,
+            **wanted_of(also or ()),
+            **priors_of(prior or ()),
         )
     _print_result(result.summary)
     typer.echo(f"results in {out}")
@@ -231,6 +192,7 @@ def calibrate(
         Literal["colmap", "paper"],
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
     ] = "colmap",
+    scene_distance: SceneDistanceOption = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
@@ -240,7 +202,10 @@ def calibrate(
     from uwsfm.sfm.options import MatchOptions, StartOptions
 
     front_end = StartOptions(
-        matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+        matching=MatchOptions(matcher=matcher),
+        scene_distance_m=scene_distance,
+        seed=seed,
+        num_threads=threads,
     )
     with ProgressBars() as progress:
         result = calibrate_housing(
@@ -252,8 +217,8 @@ def calibrate(
             progress=progress,
             strategy=strategy,
             error=error,
-            **_wanted(refine or ()),
-            **_priors(prior or ()),
+            **wanted_of(refine or ()),
+            **priors_of(prior or ()),
         )
     _print_housing(result)
     typer.echo(f"results in {out}")
@@ -277,12 +242,7 @@ def refine(
         Path | None,
         typer.Option(help="COLMAP's database: more matches, frames that it lost."),
     ] = None,
-    scene_distance: Annotated[
-        float,
-        typer.Option(
-            metavar="METRES", help="Of one camera's scene, about: no baseline tells."
-        ),
-    ] = 1.0,
+    scene_distance: SceneDistanceOption = 1.0,
     also: RefineOption = None,
     prior: PriorOption = None,
 ) -> None:
@@ -301,53 +261,16 @@ def refine(
             out,
             images=images,
             positions=positions,
-            lever_arm=_lever_arm(lever_arm),
+            lever_arm=lever_arm_of(lever_arm),
             lengths=lengths,
             database=database,
             scene_distance_m=scene_distance,
             progress=progress,
-            **_wanted(also or ()),
-            **_priors(prior or ()),
+            **wanted_of(also or ()),
+            **priors_of(prior or ()),
         )
     _print_result(result.summary)
     typer.echo(f"results in {out}")
-
-
-def _lever_arm(text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 3:
-        raise InputError(f"--lever-arm {text}: write three numbers X,Y,Z in metres")
-    return values
-
-
-def _wanted(what: Iterable[Refinable]) -> dict[str, bool]:
-    """--refine, as fields of `CalibrateOptions`."""
-    return {f"refine_{item.value.replace('-', '_')}": True for item in what}
-
-
-def _priors(texts: Iterable[str]) -> dict[str, float]:
-    """KEY=VALUE, as fields of `CalibrateOptions`."""
-    from uwsfm.calibration.problem import PRIORS
-
-    found = {}
-    for text in texts:
-        key, _, value = text.partition("=")
-        if key not in PRIORS:
-            raise InputError(f"--prior {text}: the key is one of {', '.join(PRIORS)}")
-        if key in found:
-            raise InputError(f"--prior {text}: {key} is given twice")
-        try:
-            found[key] = float(value)
-        except ValueError:
-            raise InputError(
-                f"--prior {text}: {value!r} is not a number; write KEY=VALUE"
-            ) from None
-    return found
 
 
 @app.command()
@@ -365,83 +288,6 @@ def demo(
     _print_result(result.summary)
     console.print(comparison_table(comparison))
     typer.echo(f"results in {out}: open points.ply in MeshLab, sparse/ in COLMAP")
-
-
-@simulate_app.command("images")
-def simulate_images(
-    out: Annotated[Path, typer.Option("--out", "-o", help="A new or empty folder.")],
-    preset: Annotated[
-        str,
-        typer.Option(
-            help="sample: the one in datasets; small: quick; dome: behind domes; "
-            "near: 0.3 m away, ports far off and tilted."
-        ),
-    ] = "sample",
-    frames: Annotated[
-        int | None, typer.Option(help="Only the first frames of the preset.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Another floor and noise; same rig and motion.")
-    ] = None,
-    clear_water: Annotated[
-        bool, typer.Option("--clear-water", help="No attenuation, no veil.")
-    ] = False,
-) -> None:
-    """Render stereo pairs through their ports, with a rig file and the truth."""
-    from uwsfm.console import ProgressBars
-    from uwsfm.simulate.commands import simulate_images as run
-
-    with ProgressBars() as progress:
-        run(
-            out,
-            preset=preset,
-            num_frames=frames,
-            seed=seed,
-            clear_water=clear_water,
-            progress=progress,
-        )
-    typer.echo(f"wrote {out}: try uwsfm reconstruct {out}/rig.yaml {out}/images")
-
-
-@simulate_app.command("observations")
-def simulate_observations(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file.")],
-    trajectory: Annotated[
-        Literal["rich", "strip", "lawn-mower"], typer.Option(help="How the rig moves.")
-    ] = "rich",
-    frames: Annotated[int, typer.Option(help="Stereo pairs.")] = 15,
-    altitude_m: Annotated[float, typer.Option(help="Mean height above ground.")] = 2.0,
-    relief_m: Annotated[float, typer.Option(help="Its standard deviation.")] = 0.2,
-    points: Annotated[int, typer.Option(help="Seen at least twice.")] = 800,
-    noise_px: Annotated[float, typer.Option(help="Per image coordinate.")] = 0.5,
-    outliers: Annotated[float, typer.Option(help="Share of the observations.")] = 0.0,
-    distance_m: Annotated[float, typer.Option(help="Of both ports.")] = 0.02,
-    thickness_m: Annotated[float, typer.Option(help="Of both glasses.")] = 0.005,
-    focal_px: Annotated[float, typer.Option(help="Of both cameras.")] = 1000.0,
-    seed: Annotated[int, typer.Option(help="Of floor, points and noise.")] = 0,
-) -> None:
-    """Simulate what a stereo rig observes, with ground truth, as arrays."""
-    from uwsfm.simulate.commands import simulate_observations as run
-
-    simulated = run(
-        out,
-        trajectory=trajectory,
-        num_frames=frames,
-        altitude=altitude_m,
-        relief=relief_m,
-        num_points=points,
-        noise_px=noise_px,
-        outlier_ratio=outliers,
-        distance=distance_m,
-        thickness=thickness_m,
-        focal_px=focal_px,
-        seed=seed,
-    )
-    scene = simulated.scene
-    typer.echo(
-        f"wrote {out}: {scene.num_observations} observations of {scene.num_points} "
-        f"points in {scene.num_frames} frames"
-    )
 
 
 def _print_result(summary: dict) -> None:

@@ -29,6 +29,8 @@ from uwsfm.pipeline import (
     housing_warnings,
     locked,
     output_folder,
+    refined_rig,
+    require_effect,
     start_scene,
 )
 from uwsfm.rig import Rig
@@ -214,30 +216,3 @@ def _require_distances_held(
             "give the distances and write refine: [normal] for every camera, or "
             f"{'use more frames' if num_frames == 1 else 'take another start'}"
         )
-
-
-def refined_rig(rig: Rig, scene: Scene) -> Rig:
-    """A rig with the poses, the ports and the lenses of a refined scene."""
-    found = rig.with_geometry(scene.cam_from_rig, scene.ports)
-    lenses: list[Any] = [camera.camera for camera in scene.cameras]
-    pairs = zip(found.cameras, lenses, strict=True)
-    return replace(found, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
-
-
-def require_effect(options: CalibrateOptions) -> None:
-    """Refuse what is known of a number that is not refined."""
-    refined = {
-        "distance_stddev_m": ("the port distances", options.refine_distances),
-        "normal_stddev_deg": ("the port normals", options.refine_normals),
-        "center_stddev_m": ("the centre of a dome", options.refine_centers),
-        "water_index_stddev": ("the water index", options.refine_water_index),
-        "focal_stddev": ("the focal length", options.refine_focal),
-        "principal_point_stddev_px": (
-            "the principal point",
-            options.refine_principal_point,
-        ),
-        "distortion_stddev": ("the distortion", options.refine_distortion),
-    }
-    for name, (what, wanted) in refined.items():
-        if getattr(options, name) is not None and not np.any(wanted):
-            raise InputError(f"{name} has no effect: {what} is not refined")

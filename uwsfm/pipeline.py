@@ -2,18 +2,19 @@
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.observability import verdicts
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
 from uwsfm.export.files import (
@@ -48,7 +49,7 @@ from uwsfm.sfm.options import (
     StartOptions,
 )
 from uwsfm.sfm.perspective import StartArrays
-from uwsfm.sfm.refine import Refined, refine_scene
+from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
@@ -83,9 +84,11 @@ def reconstruct(
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
+    scene_distance_m: float = 1.0,
     seed: int = 0,
     num_threads: int = -1,
     progress: Progress = silent,
+    **calibration: Any,
 ) -> ReconstructResult:
     """Reconstruct a dive: features, perspective start, refractive optimum, files.
 
@@ -108,21 +111,26 @@ def reconstruct(
             is in their frame.
         lever_arm: (3,) of the antenna they are of, in the rig, metres.
         lengths: YAML file of scale bars and distances between frames, see there.
+        scene_distance_m: Of a single camera, about; two or more measure it.
         seed: Of all random choices.
         num_threads: -1 for all cores.
         progress: Called with each long step.
+        **calibration: Fields of `CalibrateOptions`, of the last adjustment.
 
     Raises:
-        InputError: The rig file, the images or the output folder are not usable.
+        InputError: An option, the rig file, images or output folder are not usable.
         UwsfmError: The images could not be reconstructed; the message says why.
     """
-    rig, out = checked_rig(rig), output_folder(out)
+    rig = checked_rig(rig)
+    require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
+    out = output_folder(out)
     options = StartOptions(
         features=FeatureOptions(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)
         ),
         matching=MatchOptions(strategy=matching, matcher=matcher),
         mapper=mapper,
+        scene_distance_m=scene_distance_m,
         seed=seed,
         num_threads=num_threads,
     )
@@ -131,39 +139,53 @@ def reconstruct(
     known = KnownLengths.read(lengths, positions, lever_arm)
     known.check_names(rig, frames.names)
     with locked(out):
-        return _reconstruct(rig, Path(images), out, options, known, progress)
+        job = _Job(rig, Path(images), out, options, known, calibration, progress)
+        return job.run()
 
 
-def _reconstruct(
-    rig: Rig,
-    images: Path,
-    out: Path,
-    options: StartOptions,
-    known: KnownLengths,
-    progress: Progress,
-) -> ReconstructResult:
-    start = perspective_start(rig, images, out / WORK, options, progress)
-    timings = dict(start.summary["timings_s"])
-    clock = time.perf_counter()
-    arrays = start.arrays()
-    scene = start_scene(rig, start, arrays)
-    scene, lengths = known.placed(rig, arrays.frame_names, scene)
-    refined = refine_scene(scene, rig, progress, lengths=lengths)
-    timings["refractive adjustment"] = time.perf_counter() - clock
-    clock = time.perf_counter()
-    model = _model(rig, images, arrays, refined, progress)
-    export_colmap(model, out / SPARSE)
-    export_housing(model.rig, out / HOUSING, refined.calibration)
-    export_points(model, out / POINTS, refined.calibration)
-    timings["colours and export"] = time.perf_counter() - clock
-    summary = _summary(model, start, refined, timings)
-    write_json(summary, out / SUMMARY)
-    return ReconstructResult(
-        model=model,
-        calibration=refined.calibration,
-        summary=summary,
-        start=arrays,
-    )
+@dataclass(frozen=True)
+class _Job:
+    """One reconstruction, its input and how it is to be done."""
+
+    rig: Rig
+    images: Path
+    out: Path
+    options: StartOptions
+    known: KnownLengths
+    calibration: Mapping[str, Any]
+    progress: Progress
+
+    def run(self) -> ReconstructResult:
+        out = self.out
+        start = perspective_start(
+            self.rig, self.images, out / WORK, self.options, self.progress
+        )
+        timings = dict(start.summary["timings_s"])
+        clock = time.perf_counter()
+        arrays = start.arrays()
+        refined = self._refined(start, arrays)
+        timings["refractive adjustment"] = time.perf_counter() - clock
+        clock = time.perf_counter()
+        model = _model(self.rig, self.images, arrays, refined, self.progress)
+        export_colmap(model, out / SPARSE)
+        export_housing(model.rig, out / HOUSING, refined.calibration)
+        export_points(model, out / POINTS, refined.calibration)
+        timings["colours and export"] = time.perf_counter() - clock
+        summary = _summary(model, start, refined, timings)
+        write_json(summary, out / SUMMARY)
+        return ReconstructResult(
+            model=model,
+            calibration=refined.calibration,
+            summary=summary,
+            start=arrays,
+        )
+
+    def _refined(self, start: Start, arrays: StartArrays) -> Refined:
+        scene = start_scene(self.rig, start, arrays)
+        scene, lengths = self.known.placed(self.rig, arrays.frame_names, scene)
+        return refine_scene(
+            scene, self.rig, self.progress, lengths=lengths, **self.calibration
+        )
 
 
 def export_points(model: Model, path: Path, calibration: CalibrationResult) -> None:
@@ -252,7 +274,7 @@ def _model(
         for camera in rig.cameras
     ]
     return Model(
-        rig=rig.with_geometry(scene.cam_from_rig, scene.ports),
+        rig=refined_rig(rig, scene),
         scene=scene,
         frame_names=arrays.frame_names,
         keypoints=arrays.keypoints,
@@ -301,3 +323,30 @@ def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
     if not calibration.summary.converged:
         warnings.append("the refractive adjustment stopped before it converged")
     return warnings
+
+
+def refined_rig(rig: Rig, scene: Scene) -> Rig:
+    """A rig with the poses, the ports and the lenses of a refined scene."""
+    found = rig.with_geometry(scene.cam_from_rig, scene.ports)
+    lenses: list[Any] = [camera.camera for camera in scene.cameras]
+    pairs = zip(found.cameras, lenses, strict=True)
+    return replace(found, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
+
+
+def require_effect(options: CalibrateOptions) -> None:
+    """Refuse what is known of a number that is not refined."""
+    refined = {
+        "distance_stddev_m": ("the port distances", options.refine_distances),
+        "normal_stddev_deg": ("the port normals", options.refine_normals),
+        "center_stddev_m": ("the centre of a dome", options.refine_centers),
+        "water_index_stddev": ("the water index", options.refine_water_index),
+        "focal_stddev": ("the focal length", options.refine_focal),
+        "principal_point_stddev_px": (
+            "the principal point",
+            options.refine_principal_point,
+        ),
+        "distortion_stddev": ("the distortion", options.refine_distortion),
+    }
+    for name, (what, wanted) in refined.items():
+        if getattr(options, name) is not None and not np.any(wanted):
+            raise InputError(f"{name} has no effect: {what} is not refined")

@@ -29,7 +29,6 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
-from uwsfm.housing_pipeline import refined_rig, require_effect
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import (
@@ -38,6 +37,8 @@ from uwsfm.pipeline import (
     housing_warnings,
     locked,
     output_folder,
+    refined_rig,
+    require_effect,
 )
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
