@@ -156,6 +156,11 @@ def test_folders_without_a_usable_model_are_refused(dive, plain, tmp_path):
     (tmp_path / "cut" / "images.bin").write_bytes(data[: len(data) // 2])
     refused(tmp_path / "cut", "not a COLMAP model")
     found = pycolmap.Reconstruction(str(plain))
+    found.frames[1].rig_from_world.translation[0] = np.nan
+    refused(
+        write(found, tmp_path / "nan", old=True), "pose of image left/0000.jpg is not"
+    )
+    found = pycolmap.Reconstruction(str(plain))
     for point_id in list(found.points3D):
         found.delete_point3D(point_id)
     refused(write(found, tmp_path / "pointless", old=True), "has no points that its")
