@@ -71,6 +71,7 @@ def test_lost_frames_and_images_are_registered_from_all_matches(dive, tmp_path):
     )
     assert database.read_bytes() == content
     assert result.summary["num_registered_frames"] == NUM_FRAMES
+    assert result.summary["reprojection_rms_px"]["before"] > 5.0  # before anything
     scene, full = result.model.scene, dive.optimum.scene
     seen = set(zip(scene.camera_idx.tolist(), scene.frame_idx.tolist(), strict=True))
     assert seen >= LOST

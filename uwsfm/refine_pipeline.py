@@ -205,11 +205,12 @@ class _Job:
         refined = self._refined(tracks, None, options)
         self._require_raw(refined)
         if self.database is not None:
-            known = tracks.scene
+            known, before = tracks.scene, refined.start_rms_px
             tracks = with_database(
                 self.database, refined, tracks.frame_names, self.progress
             )
             refined = self._refined(tracks, known, options)
+            refined = replace(refined, start_rms_px=before)  # of the model, not of this
         self.timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]

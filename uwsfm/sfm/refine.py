@@ -94,7 +94,9 @@ def refine_scene(
     def solve(scene: Scene, keep: NDArray[np.bool_]) -> CalibrationResult:
         keep[given.clicked] = True
         part, used = scene.select(_require(keep, scene))
-        inside = with_click_noise(given, scene).in_part(keep, used)
+        inside = None
+        if lengths is not None:
+            inside = with_click_noise(given, scene).in_part(keep, used)
         return calibrate(part, known=known, lengths=inside, report=report, **options)
 
     keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
