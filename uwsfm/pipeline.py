@@ -183,8 +183,15 @@ class _Job:
     def _refined(self, start: Start, arrays: StartArrays) -> Refined:
         scene = start_scene(self.rig, start, arrays)
         scene, lengths = self.known.placed(self.rig, arrays.frame_names, scene)
+        # What is known beforehand is known of the rig file's ports, not of the map's.
+        known = replace(scene, cameras=self.rig.refractive_cameras())
         return refine_scene(
-            scene, self.rig, self.progress, lengths=lengths, **self.calibration
+            scene,
+            self.rig,
+            self.progress,
+            known=known,
+            lengths=lengths,
+            **self.calibration,
         )
 
 

@@ -266,6 +266,10 @@ def _gauss_newton_step(views, chosen, count, x, y, z, jac):
 def _best_hypothesis(views, left, num_left, limit, max_cosine, seed, chosen):
     """(found, x, y, z): the point of two rays with the least truncated cost."""
     num_pairs = num_left * (num_left - 1) // 2
+    num_images = 1
+    for k in range(1, num_left):
+        if views.image[left[k]] != views.image[left[k - 1]]:
+            num_images += 1
     best_cost, found, x, y, z = math.inf, False, 0.0, 0.0, 0.0
     state = np.uint64(seed)
     a, b = 0, 0
@@ -290,6 +294,8 @@ def _best_hypothesis(views, left, num_left, limit, max_cosine, seed, chosen):
         cost, count = _select(views, left, num_left, px, py, pz, limit, chosen)
         if count >= 2 and cost < best_cost:
             best_cost, found, x, y, z = cost, True, px, py, pz
+            if count == num_images:  # no wrong one among them: the rest is refinement
+                break
     return found, x, y, z
 
 
