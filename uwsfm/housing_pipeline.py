@@ -114,7 +114,9 @@ def calibrate_housing(
             job = replace(job, start="pairs")
     elif start == "pairs":
         raise InputError(f"{source} is a model: start 'pairs' works from images")
-    model = None if found is None else start_from_model(found, rig)
+    model = None
+    if found is not None:
+        model = start_from_model(found, rig, job.front_end.scene_distance_m)
     with locked(out):
         return job.run(model)
 
