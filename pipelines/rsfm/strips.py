@@ -1,6 +1,6 @@
 """Strips over a sea floor: what refraction does to a survey, and what removes it.
 
-    python -m pipelines.rsfm.strips -o OUT [--runs 5] [--processes 2]
+    python pipelines/rsfm/strips.py -o OUT [--runs 5] [--processes 2]
 
 A stereo rig flies 30 frames along a straight line. The same observations are adjusted
 with pinholes (fitted to the ports at the distance of the floor, then held; or
@@ -10,6 +10,7 @@ the truth, never scaled. OUT receives strips.csv, strips.md and strips.png.
 """
 
 import argparse
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
@@ -21,8 +22,6 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import uwsfm
-from pipelines.paper.plots import BLUE, GRAY, ORANGE, TEAL, VIOLET, new_figure, save
-from pipelines.paper.tables import Row, markdown, select, write_csv
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows, triangulate_tracks
 from uwsfm.rig import Rig
@@ -35,6 +34,11 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import known_cam_from_rig, nominal_rig, paper_rig
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
+
+sys.path.append(str(Path(__file__).parent.parent / "paper"))
+
+from plots import BLUE, GRAY, ORANGE, TEAL, VIOLET, new_figure, save  # noqa: E402
+from tables import Row, markdown, select, write_csv  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -194,7 +198,7 @@ def measured(result: uwsfm.CalibrationResult, truth: uwsfm.Scene) -> Row:
     scene = result.scene
     use = finite_rows(scene.points)
     found, true = scene.points[use], truth.points[use]
-    turn, scale = _procrustes(found, true)
+    turn, scale = similarity(found, true)
     error = (found - found.mean(axis=0)) @ turn.T + true.mean(axis=0) - true
     centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
     centers = (centers - found.mean(axis=0)) @ turn.T + true.mean(axis=0)
@@ -210,7 +214,7 @@ def measured(result: uwsfm.CalibrationResult, truth: uwsfm.Scene) -> Row:
     }
 
 
-def _procrustes(found: Array, true: Array) -> tuple[Array, float]:
+def similarity(found: Array, true: Array) -> tuple[Array, float]:
     """Rotation, and the scale of the best similarity, from found to true points."""
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, values, vt = np.linalg.svd(b.T @ a)
