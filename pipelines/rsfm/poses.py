@@ -3,7 +3,7 @@
     python pipelines/rsfm/poses.py -o OUT [--absolute 1000] [--relative 300]
 
 OUT receives poses.md and two CSV files. Every method sees the same trials; times are of
-one thread, without the making of the trials.
+one thread, without the making of the trials. 0 runs keep a table as it is.
 """
 
 import argparse
@@ -28,10 +28,11 @@ from pose_methods import (  # noqa: E402
     relative_errors,
 )
 from pose_trials import PORTS, absolute_trial, relative_trial  # noqa: E402
-from tables import Row, markdown, write_csv  # noqa: E402
+from tables import Row, markdown, read_csv, write_csv  # noqa: E402
 
 from uwsfm._files import replaced_file  # noqa: E402
 
+ABSOLUTE_CSV, RELATIVE_CSV = "absolute_pose.csv", "relative_pose.csv"
 NOISES_PX = (0.0, 0.5, 1.2, 2.0)
 PEER = "Refractive COLMAP"
 # Its medians and times per pose, measured with its own programs: see README.md.
@@ -51,12 +52,14 @@ def main() -> None:
     options = parse()
     options.out.mkdir(parents=True, exist_ok=True)
     with threadpool_limits(1):
-        absolute = study_absolute(options.absolute)
-        relative = study_relative(options.relative)
-    write_csv(absolute, options.out / "absolute_pose.csv")
-    write_csv(relative, options.out / "relative_pose.csv")
+        if options.absolute:
+            rows = study_absolute(options.absolute)
+            write_csv(rows, options.out / ABSOLUTE_CSV)
+        if options.relative:
+            rows = study_relative(options.relative)
+            write_csv(rows, options.out / RELATIVE_CSV)
     with replaced_file(options.out / "poses.md") as partial:
-        partial.write_text(page(absolute, relative, options), encoding="utf-8")
+        partial.write_text(page(options.out), encoding="utf-8")
     print(options.out / "poses.md")
 
 
@@ -68,8 +71,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--absolute", type=int, default=1000, metavar="RUNS")
     parser.add_argument("--relative", type=int, default=300, metavar="RUNS")
     options = parser.parse_args()
-    if min(options.absolute, options.relative) < 1:
-        parser.error("it takes one run at least")
+    if min(options.absolute, options.relative) < 0:
+        parser.error("RUNS must not be negative")
     return options
 
 
@@ -150,7 +153,13 @@ def rows_of(
     if peer is not None:
         row = row_of(port, noise, PEER, [peer], second)
         rows.append(
-            {**row, f"p95_{second}": None, "milliseconds": peer_ms, "lost": None}
+            {
+                **row,
+                f"p95_{second}": None,
+                "milliseconds": peer_ms,
+                "lost": None,
+                "runs": None,
+            }
         )
     return rows
 
@@ -164,24 +173,24 @@ def row_of(
         "port": port,
         "noise_px": noise,
         "method": method,
+        "runs": len(table),
         "rotation_deg": float(np.median(table[:, 0])),
         second: float(np.median(table[:, 1])),
         f"p95_{second}": float(np.percentile(table[:, 1], 95.0)),
-        "milliseconds": f"{np.median(table[:, 2]):.1f}" if table.shape[1] > 2 else None,
+        "milliseconds": float(np.median(table[:, 2])) if table.shape[1] > 2 else None,
         "lost": int(np.count_nonzero(~np.isfinite(table[:, 0]))),
     }
 
 
-def page(
-    absolute: Sequence[Row], relative: Sequence[Row], options: argparse.Namespace
-) -> str:
+def page(out: Path) -> str:
+    """The tables that are there, in Markdown."""
     common = {
         "port": ("port", ""),
         "noise_px": ("noise, px", ".1f"),
         "method": ("method", ""),
         "rotation_deg": ("rotation, deg", ".2g"),
     }
-    end = {"milliseconds": ("CPU, ms", ""), "lost": ("no pose", "d")}
+    end = {"milliseconds": ("CPU, ms", ".3g"), "lost": ("no pose", ".0f")}
     position = {
         "position_mm": ("position, mm", ".3g"),
         "p95_position_mm": ("95 %", ".3g"),
@@ -190,15 +199,17 @@ def page(
         "direction_deg": ("direction, deg", ".2g"),
         "p95_direction_deg": ("95 %", ".2g"),
     }
-    return "\n\n".join(
-        [
-            HEADER,
-            f"## Absolute pose: medians of {options.absolute} runs",
-            markdown(absolute, {**common, **position, **end}),
-            f"## Relative pose: medians of {options.relative} runs",
-            markdown(relative, {**common, **direction, **end}) + "\n",
-        ]
-    )
+    sections = [HEADER]
+    for title, name, columns in (
+        ("Absolute pose", ABSOLUTE_CSV, position),
+        ("Relative pose", RELATIVE_CSV, direction),
+    ):
+        if (out / name).exists():
+            rows = read_csv(out / name)
+            runs = f"{rows[0]['runs']:.0f} runs"
+            sections.append(f"## {title}: medians of {runs}")
+            sections.append(markdown(rows, {**common, **columns, **end}))
+    return "\n\n".join(sections) + "\n"
 
 
 HEADER = """# Poses from matches

@@ -193,6 +193,32 @@ def _on_ray(ray, length):
 
 
 @kernel
+def _origins(ray_a, ray_b, ray_c):
+    """The mean of three origins, and how far apart they are."""
+    x = (ray_a[0] + ray_b[0] + ray_c[0]) / 3.0
+    y = (ray_a[1] + ray_b[1] + ray_c[1]) / 3.0
+    z = (ray_a[2] + ray_b[2] + ray_c[2]) / 3.0
+    spread = abs(ray_a[0] - x) + abs(ray_a[1] - y) + abs(ray_a[2] - z)
+    spread += abs(ray_b[0] - x) + abs(ray_b[1] - y) + abs(ray_b[2] - z)
+    return (x, y, z), spread
+
+
+@kernel
+def _write_pose(in_rig, rig_anchor, in_world, world_anchor, pose):
+    """The row of [R | t] that takes axes and a point of the world to the rig's."""
+    for m in range(3):
+        turned = 0.0
+        for l in range(3):
+            pose[4 * m + l] = (
+                in_rig[m] * in_world[l]
+                + in_rig[3 + m] * in_world[3 + l]
+                + in_rig[6 + m] * in_world[6 + l]
+            )
+            turned += pose[4 * m + l] * world_anchor[l]
+        pose[4 * m + 3] = rig_anchor[m] - turned
+
+
+@kernel
 def poses_from_three(rays, points, i, j, k, ranges, poses):
     """Poses from three points and the rays that they lie on.
 
@@ -222,19 +248,7 @@ def poses_from_three(rays, points, i, j, k, ranges, poses):
         squares[2],
         ranges,
     )
-    centre = (
-        (ray_a[0] + ray_b[0] + ray_c[0]) / 3.0,
-        (ray_a[1] + ray_b[1] + ray_c[1]) / 3.0,
-        (ray_a[2] + ray_b[2] + ray_c[2]) / 3.0,
-    )
-    spread = (
-        abs(ray_a[0] - centre[0])
-        + abs(ray_a[1] - centre[1])
-        + abs(ray_a[2] - centre[2])
-        + abs(ray_b[0] - centre[0])
-        + abs(ray_b[1] - centre[1])
-        + abs(ray_b[2] - centre[2])
-    )
+    centre, spread = _origins(ray_a, ray_b, ray_c)
     in_world = _frame(a, b, c)
     kept = 0
     for n in range(found):
@@ -242,22 +256,10 @@ def poses_from_three(rays, points, i, j, k, ranges, poses):
         shift = spread / min(row[0], row[1], row[2])
         if not _follow(ray_a, ray_b, ray_c, row, squares, centre, shift):
             continue
-        in_rig = _frame(
-            _on_ray(ray_a, row[0]), _on_ray(ray_b, row[1]), _on_ray(ray_c, row[2])
-        )
         anchor = _on_ray(ray_a, row[0])
+        in_rig = _frame(anchor, _on_ray(ray_b, row[1]), _on_ray(ray_c, row[2]))
         pose = poses[kept]
-        for m in range(3):
-            for l in range(3):
-                pose[4 * m + l] = (
-                    in_rig[m] * in_world[l]
-                    + in_rig[3 + m] * in_world[3 + l]
-                    + in_rig[6 + m] * in_world[6 + l]
-                )
-            turned = (
-                pose[4 * m] * a[0] + pose[4 * m + 1] * a[1] + pose[4 * m + 2] * a[2]
-            )
-            pose[4 * m + 3] = anchor[m] - turned
+        _write_pose(in_rig, anchor, in_world, a, pose)
         if abs(pose[0]) < math.inf:
             kept += 1
     return kept
