@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -10,7 +11,7 @@ from sfm_scenes import model_of
 import uwsfm
 from uwsfm.colmap import Model, to_reconstruction
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
-from uwsfm.export.pinhole_files import pinhole_report
+from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.export.scene_ply import export_scene_ply
 from uwsfm.export.warp import warp_maps
@@ -127,3 +128,36 @@ def test_scene_ply_holds_finite_vertices(model, tmp_path):
     kinds = [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in "rgb"]
     rows = np.frombuffer(body, dtype=kinds, count=count)
     assert all(np.isfinite(rows[axis]).all() for axis in "xyz")
+
+
+def test_images_that_a_frame_lacks_are_nowhere(tmp_path):
+    """Not in the report, not asked for, not drawn."""
+    rig = RIGS["dome and flat"]
+    options = ObservationOptions(num_points=150, noise_px=0.3, seed=2)
+    full = model_of(rig, simulate_scene(rig, rich_motion(3), None, options).scene)
+    gone = (full.scene.camera_idx == 1) & (full.scene.frame_idx == 2)
+    scene, points = full.scene.select(~gone)
+    left, right = full.keypoints
+    model = replace(
+        full,
+        scene=scene,
+        keypoints=(left, (*right[:2], np.empty((0, 2)))),
+        keypoint_idx=full.keypoint_idx[~gone],
+        colors=full.colors[points],
+    )
+    for camera, frame in np.ndindex(2, 3):
+        path = tmp_path / "images" / model.image_name(camera, frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if model.has_image(camera, frame):
+            cv2.imwrite(str(path), np.zeros((600, 800), dtype=np.uint8))
+    found = export_pinhole(model, tmp_path / "out", tmp_path / "images")
+    missing = model.image_name(1, 2)
+    assert missing not in {error.name for error in found.errors}
+    stock = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
+    assert missing not in {image.name for image in stock.images.values()}
+    sizes = []
+    for which in (full, model):
+        export_scene_ply(which, tmp_path / "scene.ply")
+        sizes.append((tmp_path / "scene.ply").stat().st_size)
+        (tmp_path / "scene.ply").unlink()
+    assert sizes[1] < sizes[0]

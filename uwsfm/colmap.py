@@ -46,6 +46,10 @@ class Model:
         """Path of an image below the image directory."""
         return f"{self.rig.cameras[camera].images}/{self.frame_names[frame]}"
 
+    def has_image(self, camera: int, frame: int) -> bool:
+        """Whether a frame has an image of a camera."""
+        return len(self.keypoints[camera][frame]) > 0
+
     def errors_px(self) -> Array:
         """True reprojection error of each observation (N,), NaN if invalid."""
         return np.linalg.norm(self.scene.residuals(), axis=1)

@@ -105,7 +105,8 @@ def pinhole_model(model: Model) -> PinholeModel:
             num_dropped += int(np.count_nonzero(~finite))
             of_camera.append(depth)
             keypoints_of_camera.append(all_xy[finite])
-            errors.append(_image_error(model.image_name(c, f), seen))
+            if model.has_image(c, f):
+                errors.append(_image_error(model.image_name(c, f), seen))
         depths.append(tuple(of_camera))
         keypoints.append(tuple(keypoints_of_camera))
     virtual = _virtual_scene(scene, pinholes, keypoints, kept_idx)

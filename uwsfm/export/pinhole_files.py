@@ -118,8 +118,9 @@ def _largest(values: list[float]) -> float | None:
 
 
 def _places(model: Model) -> list[tuple[int, int]]:
-    cameras, frames = len(model.scene.cameras), model.scene.num_frames
-    return [(c, f) for c in range(cameras) for f in range(frames)]
+    """Camera and frame of the images that are there."""
+    shape = len(model.scene.cameras), model.scene.num_frames
+    return [(c, f) for c, f in np.ndindex(shape) if model.has_image(c, f)]
 
 
 def _check_images(model: Model, images: Path) -> None:
@@ -142,7 +143,7 @@ def _warp_all(
     """Write images and masks; the share of each image that points surround."""
     known = {}
     places = _places(model)
-    for done, (c, f) in enumerate(places):
+    for done, (c, f) in enumerate(places, start=1):
         name = model.image_name(c, f)
         camera = model.scene.cameras[c]
         image = read_image(images / name, camera)
@@ -150,5 +151,5 @@ def _warp_all(
         write_image(folder / "images" / name, warp_image(image, maps))
         write_image(folder / "masks" / f"{name}.png", np.uint8(255) * mask)
         known[name] = float(np.mean(mask))
-        progress("warping images", done + 1, len(places))
+        progress("warping images", done, len(places))
     return known

@@ -70,7 +70,9 @@ def export_scene_ply(model: Model, path: str | Path, *, unit: str = "metre") -> 
         world_from_cam = rigid3.inverse(
             rigid3.compose(scene.cam_from_rig[index], scene.rig_from_world)
         )
-        for pose in world_from_cam:
+        for frame, pose in enumerate(world_from_cam):
+            if not model.has_image(index, frame):
+                continue
             vertices.append(rigid3.transform(pose, lines.vertices))
             colors.append(lines.colors)
             edges.append(lines.edges + count)
