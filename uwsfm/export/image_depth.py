@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import ConvexHull, Delaunay, KDTree
+from threadpoolctl import ThreadpoolController
 
 from uwsfm.geometry.rigid3 import Array
 
@@ -18,6 +19,7 @@ _MIN_POINTS = 4
 _MARGIN = 0.25
 _ON_HULL_PX = 1e-6
 _STRIP_PX = 8
+_THREADS = ThreadpoolController()
 
 
 class ImageDepth:
@@ -47,17 +49,20 @@ class ImageDepth:
         self._hull = np.empty((0, 3))
         # Three points in a row, too, have no triangles.
         spread = pixels - pixels.mean(axis=0) if len(pixels) else pixels
-        if len(pixels) < _MIN_POINTS or np.linalg.matrix_rank(spread, tol=1.0) < 2:
+        if len(pixels) < _MIN_POINTS or _is_row(spread):
             return
         self._hull = ConvexHull(pixels).equations  # (h, 3): inside where <= 0
         anchors = _anchors(pixels, size)
         distance, near = KDTree(pixels).query(anchors, k=min(_NEIGHBOURS, len(pixels)))
         weights = 1.0 / (distance + 1.0)
         at_anchors = np.sum(weights * values[near], axis=1) / weights.sum(axis=1)
-        self._interpolator = LinearNDInterpolator(
-            Delaunay(np.concatenate([pixels, anchors])),
-            np.concatenate([values, at_anchors]),
-        )
+        triangles = Delaunay(np.concatenate([pixels, anchors]))
+        # One LAPACK call per triangle, kept from here on: threads would only wait for
+        # each other, 50 ms an image on a busy machine.
+        with _THREADS.limit(limits=1, user_api="blas"):
+            triangles.transform  # noqa: B018
+        at_all = np.concatenate([values, at_anchors])
+        self._interpolator = LinearNDInterpolator(triangles, at_all)
 
     def inverse(self, xy: ArrayLike) -> Array:
         """Inverse depth (N,) at pixels (N, 2); NaN where they are."""
@@ -81,6 +86,13 @@ class ImageDepth:
         for a, b, c in self._hull:
             inside &= a * pixels[:, 0] + b * pixels[:, 1] + c <= _ON_HULL_PX
         return inside
+
+
+def _is_row(spread: Array) -> bool:
+    """Whether centred pixels (n, 2) lie on a line, to within a pixel or so."""
+    (xx, xy), (_, yy) = np.einsum("ni,nj->ij", spread, spread)
+    smaller = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy))
+    return bool(smaller < 1.0)
 
 
 def _anchors(xy: Array, size: tuple[int, int]) -> Array:
