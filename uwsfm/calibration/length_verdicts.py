@@ -47,11 +47,15 @@ def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
         )
     if word == "weakly determined":
         assert stddev is not None
-        given = result.lengths is not None or result.positions is not None
-        how = "" if given or len(result.scene.cameras) > 1 else "by refraction alone, "
         sentences.append(
-            f"the scale is weakly determined, {how}with a standard deviation of "
-            f"{1e2 * stddev:.0f} %, which all lengths share; {ASK_FOR_LENGTH}"
+            "the scale is weakly determined, with a standard deviation of "
+            f"{1e2 * stddev:.0f} % that all lengths share; {ASK_FOR_LENGTH}"
+        )
+    given = result.lengths is not None or result.positions is not None
+    if stddev is not None and len(result.scene.cameras) == 1 and not given:
+        sentences.append(
+            "the scale comes from refraction alone, with the port taken as given: if "
+            "its distance from the lens is 1 % wrong, all lengths are, about"
         )
     if result.lengths is not None:
         sentences += _contradicted(result.lengths)

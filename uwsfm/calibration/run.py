@@ -33,6 +33,8 @@ MIN_NOISE_PX = 0.01
 MIN_SIGMA_PX = 1e-6
 
 MAX_SCALE_STEPS = 10
+SCALE_TOLERANCE = 0.03
+"""Standard deviations: poses bend with the scale, and are better known than it."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,7 @@ class Run:
             factor = self.outside.scale_factor(solved.state, stddev)
             if factor is None:
                 break
-            if abs(factor - 1.0) < 0.1 * stddev:
+            if abs(factor - 1.0) < SCALE_TOLERANCE * stddev:
                 if pruned:
                     self.outside.hold_scale = False
                     return replace(solved, layout=self._free(solved.layout))
