@@ -102,6 +102,6 @@ def _positions(fit: PositionFit) -> list[str]:
         sentences.append(
             f"the turn of the model about ({x:+.2f}, {y:+.2f}, {z:+.2f}) in the frame "
             f"of the positions is {word} (standard deviation {degrees:.0f} deg): they "
-            "lie nearly on a straight line"
+            "lie nearly on a line, or scatter widely"
         )
     return sentences
