@@ -124,6 +124,19 @@ def test_clicked_scale_bar_makes_one_camera_metric(mono, tmp_path, rng):
     assert result.model.scene.num_points <= mono.truth.num_points
 
 
+def test_clicked_scale_bar_makes_a_housing_metric(mono, tmp_path, rng):
+    """Calibrated alone, from the same model: the port's distance in millimetres."""
+    bar = scale_bar(mono.truth, ["left"], rng, click_px=1.0)
+    file = lengths_yaml(tmp_path / "lengths.yaml", scale_bars=[bar])
+    result = uwsfm.calibrate_housing(
+        mono.rig, mono.model, tmp_path / "out", lengths=file
+    )
+    assert result.summary["scale"]["unit"] == "metre"
+    (camera,) = result.summary["cameras"]
+    error = camera["distance_m"] - mono.truth.ports[0].distance
+    assert abs(error) < 3.0 * camera["distance_stddev_m"] < 0.02
+
+
 def test_distance_of_frames_makes_one_camera_metric(mono, tmp_path):
     origins = centers(mono.truth.rig_from_world)
     length = float(np.linalg.norm(origins[11] - origins[8]))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
@@ -23,6 +24,7 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
+from uwsfm.known_lengths import KnownLengths
 from uwsfm.pipeline import (
     WORK,
     checked_rig,
@@ -68,6 +70,9 @@ def calibrate_housing(
     *,
     start: Start = "virtual",
     front_end: StartOptions | None = None,
+    positions: str | Path | None = None,
+    lever_arm: ArrayLike | None = None,
+    lengths: str | Path | None = None,
     progress: Progress = silent,
     **options: Any,
 ) -> HousingResult:
@@ -83,6 +88,7 @@ def calibrate_housing(
             "pairs": matches between the cameras of one frame only, with rig and
             distances as given (section 3.2.1). One frame alone is "pairs".
         front_end: how features are found and matched.
+        positions, lever_arm, lengths: as in `reconstruct`.
         progress: called with each long step.
         **options: fields of `CalibrateOptions`.
 
@@ -99,6 +105,7 @@ def calibrate_housing(
     merged = {**rig_options(rig), **options}
     # A wrong option fails before anything is written.
     require_effect(CalibrateOptions.parsed(merged))
+    known = KnownLengths.read(lengths, positions, lever_arm)
     source, out = Path(source), output_folder(out)
     if (out / SPARSE).exists():
         raise InputError(
@@ -106,17 +113,25 @@ def calibrate_housing(
             "another folder"
         )
     found = find_model(source)
-    job = _Job(rig, source, out, start, front_end or StartOptions(), progress, merged)
+    front_end = front_end or StartOptions()
+    job = _Job(rig, source, out, start, front_end, known, progress, merged)
     if found is None:
         frames = find_frames(source, rig, min_num_frames=1)
+        known.check_names(rig, frames.names)
         if start == "pairs" or len(frames.names) == 1:
             _require_distances_held(rig, merged, len(frames.names))
             job = replace(job, start="pairs")
+            if known.given:
+                raise InputError(
+                    "single stereo pairs tell normals only: lengths and positions have "
+                    "no effect"
+                )
     elif start == "pairs":
         raise InputError(f"{source} is a model: start 'pairs' works from images")
     model = None
     if found is not None:
-        model = start_from_model(found, rig, job.front_end.scene_distance_m)
+        model = start_from_model(found, rig, front_end.scene_distance_m)
+        known.check_names(rig, model.tracks.frame_names)
     with locked(out):
         return job.run(model)
 
@@ -130,6 +145,7 @@ class _Job:
     out: Path
     start: Start
     front_end: StartOptions
+    known: KnownLengths
     progress: Progress
     options: Mapping[str, Any]
 
@@ -137,20 +153,26 @@ class _Job:
         if self.start == "pairs":
             calibration = self._from_pairs()
         else:
-            scene = self._from_images() if model is None else model.tracks.scene
+            if model is None:
+                scene, names = self._from_images()
+            else:
+                scene, names = model.tracks.scene, model.tracks.frame_names
             if self.start == "paper":
                 scene, _ = perspective_adjustment(scene, loss="cauchy")
-            options = dict(self.options)
+            scene, lengths = self.known.placed(self.rig, names, scene)
+            options = {"lengths": lengths, **self.options}
             calibration = refine_scene(
                 scene, self.rig, self.progress, **options
             ).calibration
         return self._finish(calibration, () if model is None else model.warnings)
 
-    def _from_images(self) -> Scene:
+    def _from_images(self) -> tuple[Scene, Sequence[str]]:
+        """The start, and the names of its frames."""
         start = perspective_start(
             self.rig, self.source, self.out / WORK, self.front_end, self.progress
         )
-        return start_scene(self.rig, start, start.arrays())
+        arrays = start.arrays()
+        return start_scene(self.rig, start, arrays), arrays.frame_names
 
     def _from_pairs(self) -> CalibrationResult:
         """Normals from single stereo pairs: section 3.2.1."""

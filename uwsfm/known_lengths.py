@@ -60,6 +60,11 @@ class KnownLengths:
             lever_arm=arm,
         )
 
+    @property
+    def given(self) -> bool:
+        """Whether there is any."""
+        return self.file is not None or self.table is not None
+
     def check_names(self, rig: Rig, frame_names: Sequence[str]) -> None:
         """Refuse names that no image has.
 
@@ -105,7 +110,7 @@ class KnownLengths:
         Raises:
             InputError: an end of a scale bar, or a frame of a distance, is not there.
         """
-        if self.file is None and self.table is None:
+        if not self.given:
             return scene, None
         index = {name: f for f, name in enumerate(frame_names)}
         lengths = Lengths()

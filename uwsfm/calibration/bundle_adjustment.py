@@ -106,7 +106,8 @@ def _result(run: Run, solved: Solved, seconds: float) -> CalibrationResult:
 
 def _check(scene: Scene, settings: CalibrateOptions, lengths: Lengths | None) -> None:
     plain = settings.strategy == "joint" and settings.error_name == "reprojection"
-    if (lengths is not None or len(scene.cameras) == 1) and not plain:
+    given = lengths is not None and lengths.give_scale
+    if (given or len(scene.cameras) == 1) and not plain:
         raise InputError(
             "one camera, and lengths from outside, need the joint strategy and the "
             "reprojection error"
