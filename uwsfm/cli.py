@@ -112,8 +112,8 @@ def reconstruct(
     ] = "colmap",
     mapper: Annotated[
         Literal["pinhole", "refractive"],
-        typer.Option(help="refractive: water rays in every step, not only the last."),
-    ] = "pinhole",
+        typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
+    ] = "refractive",
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,

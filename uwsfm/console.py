@@ -231,9 +231,9 @@ def comparison_table(comparison: Comparison) -> Table:
             )
     registered, given = str(comparison.num_frames), str(comparison.num_true_frames)
     table.add_row("frames", registered, "", given, "")
-    refractive, pinhole = comparison.center_rms_m, comparison.pinhole_center_rms_m
-    table.add_row("rig centres (mm RMS)", "", "", "", f"{1e3 * refractive:.2f}")
-    table.add_row("  of pinhole start", "", "", "", f"{1e3 * pinhole:.2f}")
+    after, before = comparison.center_rms_m, comparison.start_center_rms_m
+    table.add_row("rig centres (mm RMS)", "", "", "", f"{1e3 * after:.2f}")
+    table.add_row("  before the end", "", "", "", f"{1e3 * before:.2f}")
     return table
 
 

@@ -59,8 +59,8 @@ class Comparison:
     num_frames: int
     center_rms_m: float
     """Of the rig centres after moving the first pose onto the truth: no scaling."""
-    pinhole_center_rms_m: float
-    """The same of the perspective start."""
+    start_center_rms_m: float
+    """The same of the map, before the last adjustment."""
 
 
 def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Comparison:
@@ -109,7 +109,7 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
         num_true_frames=len(true_poses),
         num_frames=model.scene.num_frames,
         center_rms_m=center_rms(model.scene.rig_from_world, expected),
-        pinhole_center_rms_m=center_rms(result.start.rig_from_world, expected),
+        start_center_rms_m=center_rms(result.start.rig_from_world, expected),
     )
 
 

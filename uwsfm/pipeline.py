@@ -81,7 +81,7 @@ def reconstruct(
     masks: str | Path | None = None,
     matching: Matching = "auto",
     matcher: Matcher = "colmap",
-    mapper: Mapper = "pinhole",
+    mapper: Mapper = "refractive",
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
@@ -91,7 +91,7 @@ def reconstruct(
     progress: Progress = silent,
     **calibration: Any,
 ) -> ReconstructResult:
-    """Reconstruct a dive: features, perspective start, refractive optimum, files.
+    """Reconstruct a dive: features, a map, the refractive optimum, files.
 
     The steps before the refractive adjustment keep their results in the workspace
     ``out/uwsfm-work``: a run that was stopped goes on where it was, and one with other
@@ -106,8 +106,8 @@ def reconstruct(
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
         matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
-        mapper: "pinhole": COLMAP's, with pinholes fitted to the ports; "refractive":
-            water rays in every step, where pinholes do not get far.
+        mapper: "refractive": water rays in every step; "pinhole": COLMAP's, with
+            pinholes fitted to the ports.
         positions: CSV of positions of the frames, see `uwsfm.lengths_file`; the result
             is in their frame.
         lever_arm: (3,) of the antenna they are of, in the rig, metres.
