@@ -89,7 +89,7 @@ def _of_sets(
                     # With its time: the front end would start again on a newer file.
                     shutil.copy2(images / camera.images / frame, part / frame)
         result = uwsfm.reconstruct(
-            rig, folder / "images", folder / "out", progress=progress
+            rig, folder / "images", folder / "out", mapper="pinhole", progress=progress
         )
         missing = result.summary["unregistered_frames"]
         if missing:
