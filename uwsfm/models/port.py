@@ -6,6 +6,7 @@ Refractive COLMAP publishes, then its kind.
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,33 +42,60 @@ def _vector(what: str, values: ArrayLike) -> Array:
     return vector
 
 
-def _set_lengths(port: "FlatPort | DomePort", *names: str) -> None:
-    """Check the lengths of a frozen port, and make them floats."""
-    for name in names:
-        what = f"{type(port).__name__} {name}"
-        value = _finite(what, getattr(port, name))
-        if value < 0.0:
-            raise InputError(f"{what} must not be negative, got {value}")
-        object.__setattr__(port, name, value)
+class _Window:
+    """What flat ports and domes have in common: glass between air and water."""
 
+    _kind: ClassVar[float]
+    thickness: float
+    n_glass: float
+    n_water: float
+    n_air: float
 
-def _set_indices(port: "FlatPort | DomePort") -> None:
-    for name in ("n_air", "n_glass", "n_water"):
-        what = f"{type(port).__name__} {name}"
-        value = _finite(what, getattr(port, name))
-        if not 1.0 <= value < 4.0:
-            raise InputError(f"{what} must be a refractive index >= 1, got {value}")
-        object.__setattr__(port, name, value)
+    @property
+    def _place(self) -> tuple[float, ...]:
+        """The four numbers that say where the window is."""
+        raise NotImplementedError
+
+    @property
+    def params(self) -> Array:
+        """(8,): [Nx, Ny, Nz, int_dist, int_thick, na, ng, nw] of a flat port,
+        [Cx, Cy, Cz, int_radius, int_thick, na, ng, nw] of a dome."""
+        glass = self.thickness, self.n_air, self.n_glass, self.n_water
+        return np.array([*self._place, *glass])
+
+    @property
+    def row(self) -> Array:
+        """(PORT_SIZE,) as kernels read it."""
+        return np.append(self.params, self._kind)
+
+    def _set_lengths(self, *names: str) -> None:
+        """Check the lengths of a frozen port, and make them floats."""
+        for name in names:
+            what = f"{type(self).__name__} {name}"
+            value = _finite(what, getattr(self, name))
+            if value < 0.0:
+                raise InputError(f"{what} must not be negative, got {value}")
+            object.__setattr__(self, name, value)
+
+    def _set_indices(self) -> None:
+        for name in ("n_air", "n_glass", "n_water"):
+            what = f"{type(self).__name__} {name}"
+            value = _finite(what, getattr(self, name))
+            if not 1.0 <= value < 4.0:
+                raise InputError(f"{what} must be a refractive index >= 1, got {value}")
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
-class FlatPort:
+class FlatPort(_Window):
     """A plane-parallel window, described in the camera frame (metres).
 
     Raises:
         InputError: a normal that is not unit or points back at the camera, a negative
             distance or thickness, an index outside [1, 4), or anything not finite.
     """
+
+    _kind = FLAT
 
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector from the camera to the water; (0, 0, 1) is the optical axis."""
@@ -93,27 +121,12 @@ class FlatPort:
             )
         normal = normal / length  # not in place: the array may be the caller's
         object.__setattr__(self, "normal", tuple(float(v) for v in normal))
-        _set_lengths(self, "distance", "thickness")
-        _set_indices(self)
+        self._set_lengths("distance", "thickness")
+        self._set_indices()
 
     @property
-    def params(self) -> Array:
-        """(8,): [Nx, Ny, Nz, int_dist, int_thick, na, ng, nw]."""
-        return np.array(
-            [
-                *self.normal,
-                self.distance,
-                self.thickness,
-                self.n_air,
-                self.n_glass,
-                self.n_water,
-            ]
-        )
-
-    @property
-    def row(self) -> Array:
-        """(PORT_SIZE,) as kernels read it."""
-        return np.append(self.params, FLAT)
+    def _place(self) -> tuple[float, ...]:
+        return *self.normal, self.distance
 
     @classmethod
     def from_params(cls, params: ArrayLike) -> "FlatPort":
@@ -123,13 +136,15 @@ class FlatPort:
 
 
 @dataclass(frozen=True)
-class DomePort:
+class DomePort(_Window):
     """A spherical window around the camera, described in the camera frame (metres).
 
     Raises:
         InputError: a camera that is not inside the dome, a negative thickness, an index
             outside [1, 4), water or glass thinner than the air, or anything not finite.
     """
+
+    _kind = DOME
 
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of both spheres. At the origin, which is the projection centre, nothing
@@ -145,14 +160,14 @@ class DomePort:
     def __post_init__(self) -> None:
         center = _vector("DomePort center", self.center)
         object.__setattr__(self, "center", tuple(float(v) for v in center))
-        _set_lengths(self, "radius", "thickness")
+        self._set_lengths("radius", "thickness")
         offset = float(np.linalg.norm(center))
         if not offset < self.radius:
             raise InputError(
                 f"DomePort center is {offset:g} m away from the camera, which is not "
                 f"inside a dome of radius {self.radius:g} m then"
             )
-        _set_indices(self)
+        self._set_indices()
         if self.n_water < self.n_air or self.n_glass < self.n_air:
             raise InputError(
                 f"DomePort n_water and n_glass must not be below n_air, got "
@@ -160,23 +175,8 @@ class DomePort:
             )
 
     @property
-    def params(self) -> Array:
-        """(8,): [Cx, Cy, Cz, int_radius, int_thick, na, ng, nw]."""
-        return np.array(
-            [
-                *self.center,
-                self.radius,
-                self.thickness,
-                self.n_air,
-                self.n_glass,
-                self.n_water,
-            ]
-        )
-
-    @property
-    def row(self) -> Array:
-        """(PORT_SIZE,) as kernels read it."""
-        return np.append(self.params, DOME)
+    def _place(self) -> tuple[float, ...]:
+        return *self.center, self.radius
 
     @classmethod
     def from_params(cls, params: ArrayLike) -> "DomePort":
