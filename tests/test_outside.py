@@ -80,7 +80,6 @@ def test_scale_of_one_camera_comes_from_a_bar():
     assert abs(result.lengths.found_m[0] - result.lengths.given_m[0]) < 0.003
 
 
-@pytest.mark.slow
 def test_scale_scatters_by_its_standard_deviation():
     """20 dives: the scale's error over its standard deviation, and the prediction."""
     errors, reported = [], []
