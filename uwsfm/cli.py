@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="uwsfm",
-    help="Refractive underwater Structure-from-Motion for rigs behind flat ports.",
+    help="Refractive underwater Structure-from-Motion behind flat and dome ports.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
