@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.images import Frames
@@ -25,6 +26,8 @@ NEAR_TO_FAR = (0.7, 1.0, 1.4)
 class FixedRig:
     """The rig as a mapper begins with it."""
 
+    given: Array
+    """(C, 7) cam_from_rig before any turn."""
     rotation: RigRotation
     depths: Array
     pinholes: tuple[VirtualPinhole, ...]
@@ -64,11 +67,19 @@ def fix_rig(
         fit_virtual_pinhole(camera, depths[c]) for c, camera in enumerate(cameras)
     )
     return FixedRig(
+        given=poses,
         rotation=rotation,
         depths=depths,
         pinholes=pinholes,
         num_matches=sum(len(pair) for pair in pairs),
     )
+
+
+def turned_to(fixed: FixedRig, cam_from_rig: Array) -> FixedRig:
+    """The same, with the turns (C,) that a mapper which moves the ports ended with."""
+    turns = rigid3.compose(cam_from_rig, rigid3.inverse(fixed.given))
+    turn_deg = np.degrees(rigid3.rotation_angle(turns))
+    return replace(fixed, rotation=replace(fixed.rotation, turn_deg=turn_deg))
 
 
 def mapping_summary(

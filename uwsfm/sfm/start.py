@@ -19,7 +19,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import ENHANCED, extract_features, store_intrinsics
-from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
+from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary, turned_to
 from uwsfm.sfm.images import Frames, check_images, check_masks, find_frames
 from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping.correspondences import read_correspondences
@@ -351,10 +351,11 @@ def _map_refractive(
         progress,
     )
     best = maps[0]
+    ended = turned_to(fixed, best.cam_from_rig)
     registered = {frames.names[f] for f in np.flatnonzero(best.registered)}
     others = [int(other.registered.sum()) for other in maps[1:]]
     summary = {
         **best.counts(),
-        **mapping_summary(rig, frames, fixed, registered, others),
+        **mapping_summary(rig, frames, ended, registered, others),
     }
     write_refractive_start(space.refractive, best, summary)
