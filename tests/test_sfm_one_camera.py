@@ -1,4 +1,4 @@
-"""One camera, and rigs behind domes: the perspective start finds every frame."""
+"""One camera, domes, and mixed rigs: the mappers find every frame."""
 
 from dataclasses import replace
 
@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
 from test_mixed_ports import mixed_rig
+from test_sfm_mapping import center_errors
 
-from uwsfm import DomePort, InputError
+from uwsfm import DomePort, InputError, calibrate
 from uwsfm.geometry import rigid3
+from uwsfm.pipeline import start_scene
 from uwsfm.rig import Rig
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.perspective import StartArrays, read_start
+from uwsfm.sfm.refine import refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
@@ -81,3 +84,28 @@ def test_scene_distance_is_a_length():
     for value in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="scene_distance_m must be positive"):
             StartOptions(scene_distance_m=value)
+
+
+def test_a_rig_of_a_flat_port_a_dome_and_a_bare_lens_from_its_matches(tmp_path):
+    """From a straight port at half its distance and a concentric dome, 10 mm off."""
+    rig = mixed_rig()
+    simulated = simulated_dive(rig, num_frames=NUM_FRAMES)
+    start_rig = nominal_rig(rig)
+    frames = frames_of(start_rig, NUM_FRAMES, tmp_path)
+    write_features(tmp_path / "database.db", simulated.scene, frames, wrong=0.2)
+    options = StartOptions(num_threads=2, mapper="refractive")
+    start = start_from_matches(start_rig, frames, Steps(tmp_path), "", options)
+    arrays = start.arrays()
+    assert arrays.frame_names == frames.names
+    found = refine_scene(start_scene(start_rig, start, arrays), start_rig)
+    best = calibrate(simulated.scene, loss="l2")
+    truth = simulated.truth.rig_from_world
+    # Half of the wrong matches break a track; the rest of the data are the same.
+    errors = [
+        np.sqrt(np.mean(center_errors(scene.rig_from_world, truth) ** 2))
+        for scene in (found.scene, best.scene)
+    ]
+    assert errors[0] < 2.0 * errors[1] < 0.01
+    center, known = found.scene.ports[1].center, found.calibration.covariance.cameras[1]
+    gap = np.array(center) - rig.cameras[1].port.center
+    assert np.all(np.abs(gap) < 4.0 * np.array(known.center_stddev_m))
