@@ -122,7 +122,7 @@ class StartOptions:
     in every step."""
     seed: int = 0
     num_threads: int = -1
-    """-1: all cores. Mapping takes one, so that it is repeatable."""
+    """-1: all cores. Matching and mapping take one, so that they are repeatable."""
 
     def __post_init__(self) -> None:
         if self.mapper not in get_args(Mapper):
