@@ -146,3 +146,17 @@ def test_a_rig_of_one_camera_has_no_baseline():
         Rig(cameras=(camera,), cam_from_rig=None, baseline_m=0.2)
     with pytest.raises(InputError, match="at least one is needed"):
         Rig(cameras=(), cam_from_rig=None, baseline_m=None)
+
+
+def test_a_port_that_may_move_leaves_the_scale_of_one_camera_open():
+    """Only the glass would not grow with the rest; that is no measure of a dive."""
+    flat = mixed_rig().cameras[0]
+    single = Rig(cameras=(flat,), cam_from_rig=None, baseline_m=None)
+    scene = dive(noise_px=0.3, rig=single).scene
+    free = calibrate(scene)
+    assert free.covariance.scale_stddev is None
+    assert any("scale arbitrary" in verdict for verdict in verdicts(free, ["a"]))
+    held = calibrate(scene, refine_distances=False)
+    known = calibrate(scene, distance_stddev_m=1e-3)
+    for result in (held, known):
+        assert result.covariance.scale_stddev is not None

@@ -190,7 +190,7 @@ THIRD = {**yaml.safe_load(template())["cameras"][0], "name": "up", "images": "up
 
 MISTAKES = [
     # keys
-    ("colour", 1, "colour: unknown key; the keys here are version, water"),
+    ("colour", 1, "colour: unknown key; the keys here are version, scale, water"),
     (PORT + "distance_mm", 20, "did you mean distance_m (in metres)?"),
     (LENS + "width", 640, "intrinsics.width: unknown key, did you mean width_px"),
     (LENS + "opencv", {}, "cameras[0].intrinsics.model: unknown key; the keys here"),
@@ -283,7 +283,7 @@ def test_a_bare_baseline_is_for_two_cameras(tmp_path):
 
 def test_the_first_of_several_problems_is_told_and_the_others_counted(tmp_path):
     edits = [(PORT + "distance_m", 20), (PORT + "type", 3), ("version", "one")]
-    _check_sentence(tmp_path, _edited(*edits), "must be 1, not 'one' (and 2 more pro")
+    _check_sentence(tmp_path, _edited(*edits), "must be 1, not 'one' (and 1 more pro")
     # One slip, one problem: the key that is missing for it is not counted.
     slip = (PORT + "distance_m", DELETE), (PORT + "distance_mm", 20)
     with pytest.raises(InputError, match=r"did you mean distance_m \(in metres\)\?$"):
@@ -327,3 +327,25 @@ def test_the_template_needs_none_of_the_heavy_packages():
     run = [sys.executable, "-c", code]
     done = subprocess.run(run, cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_lengths_without_a_unit_may_have_any_size(tmp_path):
+    """Of one camera whose scale nothing told: its housing is read back all the same."""
+    rig = _load(tmp_path, template())
+    camera = replace(rig.cameras[0], port=FlatPort(distance=1.3))
+    single = Rig(cameras=(camera,), cam_from_rig=None, baseline_m=None)
+    path = tmp_path / "housing.yaml"
+    dump_rig(single, path, arbitrary_scale=True)
+    assert load_rig(path).cameras[0].port.distance == 1.3
+    dump_rig(single, path)
+    with pytest.raises(InputError, match="did you mean"):
+        load_rig(path)
+
+
+def test_a_port_of_no_known_kind_is_told_by_its_type(tmp_path):
+    for value, sentence in (
+        ({"type": "sphere", "radius_m": 0.05, "center_m": [0, 0, 0]}, "not 'sphere'"),
+        ("none", "port: write {type: none}"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            _load(tmp_path, _edited(("cameras/0/port", value)))

@@ -15,6 +15,7 @@ from uwsfm.cli_export import export, init_from
 from uwsfm.cli_options import (
     LengthsOption,
     LeverArmOption,
+    MapperOption,
     PositionsOption,
     PriorOption,
     RefineOption,
@@ -110,17 +111,16 @@ def reconstruct(
         Literal["colmap", "paper"],
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
     ] = "colmap",
-    mapper: Annotated[
-        Literal["pinhole", "refractive"],
-        typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
-    ] = "refractive",
+    mapper: MapperOption = "refractive",
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     scene_distance: SceneDistanceOption = 1.0,
     also: RefineOption = None,
     prior: PriorOption = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
+    ] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
     """Reconstruct a dive: images and a rig file in, a metric model out.
@@ -196,7 +196,9 @@ def calibrate(
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
     ] = "colmap",
     scene_distance: SceneDistanceOption = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random choices.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
+    ] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
 ) -> None:
     """Calibrate the ports only: housing.yaml, and what the images tell of it."""
@@ -284,13 +286,14 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the results.")
     ] = Path("uwsfm-demo"),
+    mapper: MapperOption = "refractive",
 ) -> None:
     """Run the main job on the sample that comes with the package."""
     from uwsfm.console import ProgressBars, comparison_table, console
     from uwsfm.demo import run_demo
 
     with ProgressBars() as progress:
-        result, comparison = run_demo(out, progress=progress)
+        result, comparison = run_demo(out, mapper, progress)
     _print_result(result.summary)
     console.print(comparison_table(comparison))
     typer.echo(f"results in {out}: open points.ply in MeshLab, sparse/ in COLMAP")

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -37,6 +37,10 @@ PriorOption = Annotated[
 ]
 
 
+MapperOption = Annotated[
+    Literal["pinhole", "refractive"],
+    typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
+]
 SceneDistanceOption = Annotated[
     float,
     typer.Option(

@@ -249,4 +249,9 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        raise InputError(f"{path}: not a COLMAP model: {error}") from None
+        cause = str(error).splitlines()[0][:80]
+        raise InputError(
+            f"{path}: not a COLMAP model that can be read: a file is damaged, or one "
+            "of cameras, images, points3D (and rigs, frames of version 4) is missing "
+            f"({cause})"
+        ) from None

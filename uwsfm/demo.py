@@ -7,6 +7,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.evaluate import Comparison, compare_with_truth
 from uwsfm.pipeline import ReconstructResult, reconstruct
+from uwsfm.sfm.options import Mapper
 
 
 def sample_dir() -> Path:
@@ -26,9 +27,15 @@ def sample_dir() -> Path:
 
 
 def run_demo(
-    out: str | Path, progress: Progress = silent
+    out: str | Path, mapper: Mapper = "refractive", progress: Progress = silent
 ) -> tuple[ReconstructResult, Comparison]:
     """Reconstruct the sample into ``out``, and compare with its truth."""
     sample = sample_dir()
-    result = reconstruct(sample / "rig.yaml", sample / "images", out, progress=progress)
+    result = reconstruct(
+        sample / "rig.yaml",
+        sample / "images",
+        out,
+        mapper=mapper,
+        progress=progress,
+    )
     return result, compare_with_truth(result, sample / "truth.json")

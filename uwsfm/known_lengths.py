@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm.calibration.lengths import Distances, Lengths, Positions
 from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.lengths_file import (
     Click,
@@ -23,6 +24,11 @@ from uwsfm.lengths_file import (
 )
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
+
+LONGEST_ARM_M = 30.0
+"""Of a lever arm; longer ones are millimetres."""
+WRONG_UNIT = 5.0
+"""Times as long as in a metric map, or shorter: no error of measurement."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +57,11 @@ class KnownLengths:
         arm = np.zeros(3) if lever_arm is None else np.asarray(lever_arm, dtype=float)
         if arm.shape != (3,) or not np.all(np.isfinite(arm)):
             raise InputError(f"lever_arm must be three numbers, got {arm.tolist()}")
+        if np.abs(arm).max() > LONGEST_ARM_M:
+            raise InputError(
+                f"lever_arm {arm.tolist()} is in metres: the antenna is not "
+                f"{np.abs(arm).max():g} m away from the camera"
+            )
         if lever_arm is not None and positions is None:
             raise InputError("lever_arm has no effect without positions")
         return cls(
@@ -117,7 +128,10 @@ class KnownLengths:
         if self.table is not None:
             lengths = replace(lengths, positions=self._positions(self.table, index))
         if self.file is not None and self.file.frame_distances:
-            lengths = replace(lengths, between_frames=self._distances(index))
+            known = self._distances(index)
+            if rig.baseline_m is not None:
+                self._check_distances(known, scene)
+            lengths = replace(lengths, between_frames=known)
         if self.file is not None and self.file.scale_bars:
             ends = _Ends(self.source, self.file.scale_bars)
             scene, lengths = ends.placed(scene, lengths, _image_index(rig, frame_names))
@@ -136,6 +150,19 @@ class KnownLengths:
             table.stddevs[rows],
             self.lever_arm,
         )
+
+    def _check_distances(self, known: Distances, scene: Scene) -> None:
+        """Refuse lengths that a metric map contradicts grossly: another unit."""
+        centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
+        first, second = known.ends.T
+        found = np.linalg.norm(centers[first] - centers[second], axis=1)
+        for i, (length, there) in enumerate(zip(known.lengths_m, found, strict=True)):
+            if not 1.0 / WRONG_UNIT < length / max(there, 1e-9) < WRONG_UNIT:
+                raise InputError(
+                    f"{self.source}: frame_distances[{i}].length_m: {length:g} m, but "
+                    f"by the rig's baseline these frames are {there:.3g} m apart: is "
+                    "it in metres, and of these frames?"
+                )
 
     def _distances(self, index: dict[str, int]) -> Distances:
         assert self.file is not None

@@ -300,6 +300,7 @@ def _summary(
     mapped = dict(start.summary)
     cameras = housing_summary(model.rig, refined.calibration)
     warnings = mapped.pop("warnings")
+    warnings += _images_without_points(model)
     warnings += housing_warnings(model.rig, refined.calibration)
     del mapped["timings_s"]
     found = errors_summary(refined.calibration)
@@ -319,6 +320,19 @@ def _summary(
         "timings_s": timings,
         "versions": versions(),
     }
+
+
+def _images_without_points(model: Model) -> list[str]:
+    scene = model.scene
+    seen = np.zeros((len(scene.cameras), scene.num_frames), dtype=bool)
+    seen[scene.camera_idx, scene.frame_idx] = True
+    names = [model.image_name(c, f) for c, f in np.argwhere(~seen).tolist()]
+    if not names:
+        return []
+    return [
+        f"{len(names)} images see no point of the result, for instance {names[0]}: do "
+        "they show the scene, and were the images of their frame taken together?"
+    ]
 
 
 def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
@@ -345,8 +359,8 @@ def refined_rig(rig: Rig, scene: Scene) -> Rig:
 def require_effect(options: CalibrateOptions) -> None:
     """Refuse what is known of a number that is not refined."""
     refined = {
-        "distance_stddev_m": ("the port distances", options.refine_distances),
-        "normal_stddev_deg": ("the port normals", options.refine_normals),
+        "distance_stddev_m": ("the distance of a port", options.refine_distances),
+        "normal_stddev_deg": ("the normal of a port", options.refine_normals),
         "center_stddev_m": ("the centre of a dome", options.refine_centers),
         "water_index_stddev": ("the water index", options.refine_water_index),
         "focal_stddev": ("the focal length", options.refine_focal),

@@ -31,7 +31,7 @@ from uwsfm.rig_schema import (
     RadialUndistortionLens,
     RigFile,
 )
-from uwsfm.rig_values import checked_baseline
+from uwsfm.rig_values import ARBITRARY_SCALE, checked_baseline
 
 # ---- Reading ------------------------------------------------------------------------
 
@@ -63,12 +63,18 @@ def load_rig(path: str | Path) -> Rig:
     Raises:
         InputError: one sentence with the file, the key path and what is wrong.
     """
+    token = None
     try:
-        return _to_rig(RigFile.model_validate(read_yaml(Path(path))))
+        data = read_yaml(Path(path))
+        token = ARBITRARY_SCALE.set(data.get("scale") == "arbitrary")
+        return _to_rig(RigFile.model_validate(data))
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    finally:
+        if token is not None:
+            ARBITRARY_SCALE.reset(token)
 
 
 def read_yaml(path: Path) -> dict:
@@ -214,6 +220,8 @@ def _sentence(problem: Any, entries: Mapping[str, type[Entry]]) -> str:
     if kind in ("too_short", "too_long"):
         number = context.get("min_length", context.get("max_length"))
         return f"needs {number} values, got {len(value)}"
+    if kind == "model_type" and value == "none":
+        return "write {type: none}"
     if kind not in _WANTED:
         return problem["msg"]
     shown = "empty" if value is None else reprlib.repr(value)
@@ -260,6 +268,8 @@ def dump_rig(
     path: str | Path,
     header_comment: str = "",
     comments: Mapping[str, Sequence[str]] | None = None,
+    *,
+    arbitrary_scale: bool = False,
 ) -> None:
     """Write a rig.yaml that `load_rig` reads back to the same values.
 
@@ -268,6 +278,7 @@ def dump_rig(
         path: Replaced as a whole, or left as it was.
         header_comment: Lines for the top of the file, without "#".
         comments: Lines above a camera, by its name; say, standard deviations.
+        arbitrary_scale: Its lengths have no unit.
     """
     comments = comments or {}
     unknown = set(comments) - {camera.name for camera in rig.cameras}
@@ -277,6 +288,7 @@ def dump_rig(
         )
     top: dict[str, Any] = {
         "version": 1,
+        **({"scale": "arbitrary"} if arbitrary_scale else {}),
         "water": {"refractive_index": _common_water(rig)},
     }
     if len(rig.cameras) > 1:

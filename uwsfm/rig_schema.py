@@ -125,15 +125,23 @@ class NoPortEntry(Entry):
         return NoPort()
 
 
+class UnknownPortEntry(NoPortEntry):
+    """Its type is what is wrong, whatever else is there."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
 def _port_tag(value: Any) -> str:
-    kind = value.get("type") if isinstance(value, dict) else None
-    return f"({kind})" if kind in _PORT_KINDS else "(flat)"
+    if not isinstance(value, dict) or "type" not in value:
+        return "(flat)"
+    return f"({value['type']})" if value["type"] in _PORT_KINDS else "(unknown)"
 
 
 PortEntry = Annotated[
     Annotated[FlatPortEntry, Tag("(flat)")]
     | Annotated[DomePortEntry, Tag("(dome)")]
-    | Annotated[NoPortEntry, Tag("(none)")],
+    | Annotated[NoPortEntry, Tag("(none)")]
+    | Annotated[UnknownPortEntry, Tag("(unknown)")],
     Discriminator(_port_tag),
 ]
 
@@ -248,6 +256,7 @@ class CameraEntry(Entry):
 
 class RigFile(Entry):
     version: Literal[1]
+    scale: Literal["metric", "arbitrary"] = "metric"
     water: WaterEntry
     baseline_stddev_m: Annotated[_Number, Field(ge=0)] = 0.0
     refine_cam_from_rig: bool = True

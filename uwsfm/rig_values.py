@@ -6,6 +6,7 @@ They catch what people get wrong: millimetres for metres, flipped signs, lost di
 from __future__ import annotations
 
 import math
+from contextvars import ContextVar
 from pathlib import PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -18,11 +19,15 @@ UNIT_TOLERANCE = 1e-9
 _COPY_TOLERANCE = 1e-3
 
 
+ARBITRARY_SCALE: ContextVar[bool] = ContextVar("ARBITRARY_SCALE", default=False)
+"""Whether the lengths that are read have no unit: none of them is implausible then."""
+
+
 def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float:
     """Refuses negative lengths, and millimetres taken for metres."""
     if value < 0:
         raise InputError(f"{value:g} m is negative; a {noun} cannot be")
-    if value > limit:
+    if value > limit and not ARBITRARY_SCALE.get():
         guess = np.format_float_positional(float(f"{value / 1000:.6g}"), min_digits=3)
         raise InputError(
             f"{value:g} m is not a {noun}; {plural} are in metres, "

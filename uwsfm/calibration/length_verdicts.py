@@ -55,7 +55,8 @@ def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     if stddev is not None and len(result.scene.cameras) == 1 and not given:
         sentences.append(
             "the scale comes from refraction alone, with the port taken as given: if "
-            "its distance from the lens is 1 % wrong, all lengths are, about"
+            "its distance from the lens is 1 % wrong, all lengths are, about, and a "
+            "tilt of a degree or two that was not given can make them twice as long"
         )
     if result.lengths is not None:
         sentences += _contradicted(result.lengths)

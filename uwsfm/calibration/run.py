@@ -13,8 +13,9 @@ from uwsfm.calibration.uncertainty import Optimum, scale_stddev
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DOME, FLAT, KIND
+from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver.layout import Layout, build_layout
+from uwsfm.solver.layout import HELD, Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import (
     LevenbergMarquardtOptions,
     LevenbergMarquardtResult,
@@ -213,6 +214,17 @@ class Run:
             scale_held=self.outside.hold_scale,
         )
 
+    @property
+    def _scales_with_port(self) -> bool:
+        """Whether a port may grow with everything else: then nothing tells the scale,
+        for the glass, which does not, hardly shows."""
+        ports, free = State.from_scene(self.scene).ports, self.columns != HELD
+        settings = self.settings
+        flat = (ports[:, KIND] == FLAT) & (settings.distance_stddev_m is None)
+        dome = (ports[:, KIND] == DOME) & (settings.center_stddev_m is None)
+        moving = flat & free[:, border.DISTANCE] | dome & free[:, border.CENTER][:, 0]
+        return bool(np.any(moving))
+
     def with_free_scale(
         self, solved: Solved, keep: NDArray[np.bool_], sigma_px: float
     ) -> Solved:
@@ -221,6 +233,8 @@ class Run:
         The optimum of every scale bends with it, and steps along that valley are tiny:
         the scale is stepped by Newton's method, and the rest solved again at each.
         """
+        if self._scales_with_port:
+            return solved
         given, held, at_zero = solved, self.outside.held_m, self.at_zero.copy()
         pruned = self.settings.loss == "l2"
         for _ in range(MAX_SCALE_STEPS if self.outside.hold_scale else 0):

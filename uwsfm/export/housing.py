@@ -19,15 +19,16 @@ def export_housing(
     rig: Rig, path: str | Path, calibration: CalibrationResult | None = None
 ) -> None:
     """Write a rig, with standard deviations as comments if known."""
-    comments, header = {}, HEADER
+    comments, header, arbitrary = {}, HEADER, False
     if calibration is not None:
-        if calibration.covariance.scale_stddev is None:
+        arbitrary = calibration.covariance.scale_stddev is None
+        if arbitrary:
             header = f"{HEADER}\n{ARBITRARY}"
         comments = {
             camera.name: _comments(rig, calibration, index)
             for index, camera in enumerate(rig.cameras)
         }
-    dump_rig(rig, path, header, comments)
+    dump_rig(rig, path, header, comments, arbitrary_scale=arbitrary)
 
 
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:

@@ -14,6 +14,8 @@ Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]
 Mapper = Literal["pinhole", "refractive"]
 
+MAX_SEED = 2**31 - 1  # COLMAP takes 32 bits
+
 
 def thread_count(num_threads: int) -> int:
     """How many threads that is on this machine; -1 means one for each core."""
@@ -139,8 +141,8 @@ class StartOptions:
                 f"num_threads must be positive, or -1 for all cores, "
                 f"got {self.num_threads}"
             )
-        if self.seed < 0:
-            raise InputError(f"seed must not be negative, got {self.seed}")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise InputError(f"seed must be between 0 and {MAX_SEED}, got {self.seed}")
 
     @property
     def threads(self) -> int:

@@ -1,0 +1,38 @@
+"""What is given of lengths and positions, and is in another unit."""
+
+import pytest
+from dense import small_scene
+
+from uwsfm import InputError
+from uwsfm.known_lengths import KnownLengths
+from uwsfm.lengths_file import load_positions
+from uwsfm.simulate.rigs import sample_rig
+
+HEADER = "frame,x,y,z,sx,sy,sz\n"
+
+
+def test_a_dive_straight_down_is_no_pair_of_degrees(tmp_path):
+    path = tmp_path / "nav.csv"
+    rows = "".join(f"{i}.png,0,0,{-0.1 * i},0.1,0.1,0.1\n" for i in range(1, 5))
+    path.write_text(HEADER + rows)
+    assert len(load_positions(path).frames) == 4
+    path.write_text(HEADER + rows.replace("-0.", "-0.00"))
+    with pytest.raises(InputError, match="within 20 mm of each other"):
+        load_positions(path)
+
+
+def test_a_lever_arm_in_millimetres_is_refused():
+    with pytest.raises(InputError, match="is not 500 m away"):
+        KnownLengths.read(None, "nav.csv", [200.0, -100.0, -500.0])
+
+
+def test_a_distance_that_the_baseline_contradicts_grossly_is_refused(tmp_path):
+    path = tmp_path / "lengths.yaml"
+    names = [f"{i}.png" for i in range(4)]
+    text = "version: 1\nframe_distances:\n"
+    text += f"  - {{frames: [{names[0]}, {names[3]}], length_m: 500, stddev_m: 1}}\n"
+    path.write_text(text)
+    scene = small_scene(4, 60).truth
+    known = KnownLengths.read(path, None, None)
+    with pytest.raises(InputError, match="500 m, but by the rig's baseline these"):
+        known.placed(sample_rig(), names, scene)
