@@ -65,12 +65,12 @@ def random_camera(port: str, rng: np.random.Generator) -> RefractiveCamera:
 
 
 def absolute_trial(port: str, noise_px: float, seed: int) -> AbsoluteTrial:
-    """200 points at 0.5 to 10 m along the rays; the camera anywhere, turned anyhow."""
+    """200 points 0.5 to 10 m from the camera, which is anywhere, turned anyhow."""
     rng = np.random.default_rng([PORTS.index(port), seed])
     camera = random_camera(port, rng)
     xy = rng.uniform(0.5, SIZE - 0.5, (NUM_MATCHES, 2))
     origins, dirs = camera.ray_from_img(xy)
-    in_cam = origins + rng.uniform(0.5, 10.0, (NUM_MATCHES, 1)) * dirs
+    in_cam = _at_distance(origins, dirs, rng.uniform(0.5, 10.0, NUM_MATCHES))
     pose = np.concatenate(
         [rigid3.quat_from_rotvec(rng.normal(size=3)), rng.uniform(0.0, 1.0, 3)]
     )
@@ -83,6 +83,13 @@ def absolute_trial(port: str, noise_px: float, seed: int) -> AbsoluteTrial:
         right=right,
         depths=np.percentile(in_cam[:, 2], [10, 50, 90]),
     )
+
+
+def _at_distance(origins: Array, dirs: Array, distances: Array) -> Array:
+    """Points (N, 3) on rays, so far from the camera (Sedlazeck & Koch 2011, eq. 5)."""
+    along = np.einsum("ni,ni->n", origins, dirs)
+    gap = distances**2 - np.einsum("ni,ni->n", origins, origins)
+    return origins + (np.sqrt(along**2 + gap) - along)[:, None] * dirs
 
 
 def relative_trial(port: str, noise_px: float, seed: int) -> RelativeTrial:
