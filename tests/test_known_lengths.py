@@ -36,3 +36,11 @@ def test_a_distance_that_the_baseline_contradicts_grossly_is_refused(tmp_path):
     known = KnownLengths.read(path, None, None)
     with pytest.raises(InputError, match="500 m, but by the rig's baseline these"):
         known.placed(sample_rig(), names, scene)
+
+
+def test_degrees_near_a_meridian_and_at_one_depth_are_degrees(tmp_path):
+    path = tmp_path / "nav.csv"
+    rows = "".join(f"{i}.png,-0.1234{i},51.50{i},-12,1,1,1\n" for i in range(4))
+    path.write_text(HEADER + rows)
+    with pytest.raises(InputError, match="are degrees of longitude and latitude"):
+        load_positions(path)

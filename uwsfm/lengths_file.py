@@ -188,18 +188,17 @@ def _row(where: str, row: list[str]) -> tuple[str, list[float]]:
 def _check_units(path: Path, positions: Array) -> None:
     span = np.ptp(positions[:, :2], axis=0)
     x, y = np.mean(positions[:, :2], axis=0)
-    if np.ptp(positions, axis=0).max() < SHORTEST_M:
-        raise InputError(
-            f"{path}: the positions lie within {1e3 * SHORTEST_M:.0f} mm of each "
-            "other: are they in metres?"
-        )
-    # A dive straight down has no such numbers.
-    degrees = 1.0 < abs(x) <= 360.0 and 1.0 < abs(y) <= 360.0
-    if span.max() < SHORTEST_M and degrees:
+    # A dive straight down may stay at zero; a longitude may be near it, not both.
+    if span.max() < SHORTEST_M and 1.0 < max(abs(x), abs(y)) <= 360.0:
         raise InputError(
             f"{path}: x and y change by {1e3 * span.max():.3g} mm only over "
             f"{len(positions)} positions: if {x:.4f} and {y:.4f} are degrees of "
             "longitude and latitude, convert them to metres in a local frame"
+        )
+    if np.ptp(positions, axis=0).max() < SHORTEST_M:
+        raise InputError(
+            f"{path}: the positions lie within {1e3 * SHORTEST_M:.0f} mm of each "
+            "other: are they in metres?"
         )
     largest = float(np.abs(positions).max())
     if largest > LARGEST_M:
