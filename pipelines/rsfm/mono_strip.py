@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from strips import OVERLAP, similarity
+from strips import OVERLAP
 
 import uwsfm
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.alignment import align
 from uwsfm.pipeline import start_scene
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import opened
@@ -71,8 +72,8 @@ def centers_rms(poses: NDArray[np.float64], truth: NDArray[np.float64]) -> float
 
 
 def rms_after_similarity(found: Any, true: Any) -> float:
-    turn, scale = similarity(found, true)
-    gap = scale * (found - found.mean(axis=0)) @ turn.T - (true - true.mean(axis=0))
+    moved = align(found, true, np.ones(len(true)), with_scale=True)
+    gap = moved.apply(found) - true
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
 
 

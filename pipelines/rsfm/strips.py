@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 
 import uwsfm
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows, triangulate_tracks
 from uwsfm.rig import Rig
 from uwsfm.simulate import (
@@ -198,29 +199,20 @@ def measured(result: uwsfm.CalibrationResult, truth: uwsfm.Scene) -> Row:
     scene = result.scene
     use = finite_rows(scene.points)
     found, true = scene.points[use], truth.points[use]
-    turn, scale = similarity(found, true)
-    error = (found - found.mean(axis=0)) @ turn.T + true.mean(axis=0) - true
-    centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
-    centers = (centers - found.mean(axis=0)) @ turn.T + true.mean(axis=0)
+    weights = np.ones(len(true))
+    moved = align(found, true, weights, with_scale=False)
+    error = moved.apply(found) - true
+    centers = moved.apply(rigid3.inverse(scene.rig_from_world)[:, 4:])
     gaps = centers - rigid3.inverse(truth.rig_from_world)[:, 4:]
     # A virtual pinhole's centre is not the lens: what is common to all does not count.
     gaps -= gaps.mean(axis=0)
     return {
         "points_rms_mm": 1e3 * _rms(error),
         "centers_rms_mm": 1e3 * _rms(gaps),
-        "scale_ppm": 1e6 * (scale - 1.0),
+        "scale_ppm": 1e6 * (align(found, true, weights, with_scale=True).scale - 1.0),
         "bend": _bend(true, error[:, 2]),
         "rms_px": result.summary.rms_px,
     }
-
-
-def similarity(found: Array, true: Array) -> tuple[Array, float]:
-    """Rotation, and the scale of the best similarity, from found to true points."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float(np.sum(values * np.diag(sign)) / np.sum(a * a))
-    return u @ sign @ vt, scale
 
 
 def _bend(points: Array, depth_error: Array) -> float:
