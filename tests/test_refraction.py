@@ -32,7 +32,9 @@ def test_refraction_keeps_n_sin_theta_and_the_plane_of_incidence(rng):
         assert abs(second * sine_out - first * sine) < 1e-14
         assert abs(np.cross(normal, ray) @ out) < 1e-14
         assert out @ normal > 0.0
-        assert python_of(refract)(*ray, *normal, first / second) == tuple(out)
+        plain = python_of(refract)(*ray, *normal, first / second)
+        # Compiled sums are fused and regrouped: a few roundings of numbers near one.
+        assert plain == pytest.approx(tuple(out), abs=1e-14)
 
 
 def test_ray_along_the_normal_goes_straight_on_and_equal_indices_bend_nothing():

@@ -66,3 +66,23 @@ def kernel(function: Function) -> Function:
         cache=CACHE_DIR is not None, nogil=True, error_model="numpy"
     )
     return compiled(function)
+
+
+# What SIMD needs and no more: sums may be regrouped, NaN stays NaN.
+_LANE_MATH = {"nsz", "arcp", "contract", "reassoc"}
+
+
+def lane(function: Function) -> Function:
+    """Compile a formula of one lane, or a loop over lanes, for SIMD.
+
+    It becomes part of its caller, else the caller's loop would not vectorise: keep it
+    free of branches (min, max, `x if ok else y`), inner loops and arrays of any length.
+    """
+    compiled: Any = numba.njit(
+        cache=CACHE_DIR is not None,
+        nogil=True,
+        error_model="numpy",
+        fastmath=_LANE_MATH,
+        forceinline=True,
+    )
+    return compiled(function)

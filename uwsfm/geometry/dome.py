@@ -17,14 +17,14 @@ sqrt(1 - k_i^2 p^2) + i k_i p, with p divided out. Scalar kernels; failure is Na
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import kernel, lane
 
 MAX_STEPS = 60
 # Below this share of R^2 the squared p takes the series: the quotient loses digits.
 SMALL_P2 = 1e-3
 
 
-@kernel
+@lane
 def dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water):
     """k_1, ..., k_6 of the dome-port equation, 1 / metres."""
     return (
@@ -37,7 +37,7 @@ def dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water):
     )
 
 
-@kernel
+@lane
 def _cosines(k, p2, first):
     """Cosines of the six angles; that of the first, which may be obtuse, is given."""
     return (
@@ -50,10 +50,44 @@ def _cosines(k, p2, first):
     )
 
 
-@kernel
+@lane
 def _cos_first(kappa, a, b, c, m2, rho):
     """Cosine of the angle between v = X - kappa c and the radius X - c."""
     return (a - b - kappa * (b - c)) / (rho * math.sqrt(m2))
+
+
+@lane
+def dome_port_start(rho, radius, outer, mu_glass, mu_water):
+    """The paraxial kappa, exact on the axis and for a concentric dome."""
+    bend = (1.0 - mu_glass) / radius + (mu_glass - mu_water) / outer
+    return 1.0 - mu_water - rho * bend
+
+
+@lane
+def _turned(real, imag, k, cos, p2):
+    """A complex number with p divided out of its imaginary part, turned by an angle."""
+    return real * cos - p2 * imag * k, real * k + imag * cos
+
+
+@lane
+def dome_port_newton(kappa, a, b, c, q, rho, radius, outer, mu_glass, mu_water):
+    """sin(F) / p at a kappa, the Newton step that it asks for, and |v|^2."""
+    m2 = a - 2.0 * kappa * b + kappa * kappa * c
+    inv_m2 = 1.0 / m2
+    p2 = q * inv_m2
+    k1, k2, k3, k4, k5, k6 = dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water)
+    c1, c2, c3, c4, c5, c6 = _cosines(
+        (k1, k2, k3, k4, k5, k6), p2, _cos_first(kappa, a, b, c, m2, rho)
+    )
+    real, imag = _turned(c1, k1, k2, c2, p2)
+    real, imag = _turned(real, imag, k3, c3, p2)
+    real, imag = _turned(real, imag, k4, c4, p2)
+    real, imag = _turned(real, imag, k5, c5, p2)
+    real, imag = _turned(real, imag, k6, c6, p2)
+    weight = k1 / c1 + k2 / c2 + k3 / c3 + k4 / c4 + k5 / c5 + k6 / c6
+    shrink = (b - kappa * c) * inv_m2  # d log(p) / d kappa
+    slope = real * (1.0 / (rho * c1) + shrink * weight) - imag * shrink
+    return imag, imag / slope, m2
 
 
 @kernel
@@ -73,28 +107,16 @@ def solve_dome_port(a, b, c, q, radius, thick, mu_glass, mu_water):
         kappa; NaN if no ray joins the point and the camera.
     """
     rho, outer = math.sqrt(a - 2.0 * b + c), radius + thick
-    bend = (1.0 - mu_glass) / radius + (mu_glass - mu_water) / outer
-    kappa = 1.0 - mu_water - rho * bend
+    kappa = dome_port_start(rho, radius, outer, mu_glass, mu_water)
     low, high = -math.inf, math.inf
     for _ in range(MAX_STEPS):
-        m2 = a - 2.0 * kappa * b + kappa * kappa * c
-        p2 = q / m2
-        k = dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water)
-        cos = _cosines(k, p2, _cos_first(kappa, a, b, c, m2, rho))
-        real, imag, weight = cos[0], k[0], k[0] / cos[0]
-        for i in range(1, 6):
-            real, imag = (
-                real * cos[i] - p2 * imag * k[i],
-                real * k[i] + imag * cos[i],
-            )
-            weight += k[i] / cos[i]
+        imag, step, m2 = dome_port_newton(
+            kappa, a, b, c, q, rho, radius, outer, mu_glass, mu_water
+        )
         if imag > 0.0:
             high = kappa
         else:
             low = kappa
-        shrink = (b - kappa * c) / m2  # d log(p) / d kappa
-        slope = real * (1.0 / (rho * cos[0]) + shrink * weight) - imag * shrink
-        step = imag / slope
         following = kappa - step
         if not low <= following <= high:
             if low == -math.inf:
@@ -111,7 +133,15 @@ def solve_dome_port(a, b, c, q, radius, thick, mu_glass, mu_water):
     return math.nan
 
 
-@kernel
+@lane
+def _cubic(k, p2):
+    """(k / cos - asin(k p) / p) / p^2, whose second terms sum to zero at a root."""
+    z = k * k * p2
+    series = 0.3 + z * (15.0 / 56.0 + z * (35.0 / 144.0 + z * 315.0 / 1408.0))
+    return k * k * k * (1.0 / 3.0 + z * series)
+
+
+@lane
 def dome_port_gradient(kappa, a, b, c, q, radius, thick, mu_glass, mu_water):
     """d kappa / d(a, b, c, radius, thick, mu_glass, mu_water) at a root.
 
@@ -122,30 +152,25 @@ def dome_port_gradient(kappa, a, b, c, q, radius, thick, mu_glass, mu_water):
     rho, outer = math.sqrt(a - 2.0 * b + c), radius + thick
     m2 = a - 2.0 * kappa * b + kappa * kappa * c
     p2 = q / m2
-    k = dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water)
-    cos = _cosines(k, p2, _cos_first(kappa, a, b, c, m2, rho))
-    total = 0.0
-    if p2 > SMALL_P2 * radius * radius:
-        for i in range(6):
-            total += k[i] / cos[i]
-        total /= p2
-    else:
-        for i in range(6):
-            # k / cos - asin(k p) / p over p^2, whose second terms sum to zero.
-            z = k[i] * k[i] * p2
-            series = 0.3 + z * (15.0 / 56.0 + z * (35.0 / 144.0 + z * 315.0 / 1408.0))
-            total += k[i] * k[i] * k[i] * (1.0 / 3.0 + z * series)
+    k1, k2, k3, k4, k5, k6 = dome_slopes(kappa, rho, radius, outer, mu_glass, mu_water)
+    c1, c2, c3, c4, c5, c6 = _cosines(
+        (k1, k2, k3, k4, k5, k6), p2, _cos_first(kappa, a, b, c, m2, rho)
+    )
+    series = _cubic(k1, p2) + _cubic(k2, p2) + _cubic(k3, p2)
+    series += _cubic(k4, p2) + _cubic(k5, p2) + _cubic(k6, p2)
+    quotient = k1 / c1 + k2 / c2 + k3 / c3 + k4 / c4 + k5 / c5 + k6 / c6
+    total = quotient / p2 if p2 > SMALL_P2 * radius * radius else series
     half = 0.5 * total / m2
-    by_rho2 = -0.5 * (k[0] / cos[0] + k[1] / cos[1]) / (rho * rho)
+    by_rho2 = -0.5 * (k1 / c1 + k2 / c2) / (rho * rho)
     by_a = by_rho2 + half * (c - p2)
     by_b = -2.0 * by_rho2 + half * (2.0 * p2 * kappa - 2.0 * b)
     by_c = by_rho2 + half * (a - p2 * kappa * kappa)
     inner2, outer2 = radius * radius, outer * outer
-    by_thick = (mu_water / cos[5] - mu_glass / cos[4]) / outer2
-    by_radius = (mu_glass / cos[3] - 1.0 / cos[2]) / inner2 + by_thick
-    by_glass = 1.0 / (outer * cos[4]) - 1.0 / (radius * cos[3])
-    by_water = 1.0 / (rho * cos[1]) - 1.0 / (outer * cos[5])
-    by_kappa = 1.0 / (rho * cos[0]) - 2.0 * half * p2 * (kappa * c - b)
+    by_thick = (mu_water / c6 - mu_glass / c5) / outer2
+    by_radius = (mu_glass / c4 - 1.0 / c3) / inner2 + by_thick
+    by_glass = 1.0 / (outer * c5) - 1.0 / (radius * c4)
+    by_water = 1.0 / (rho * c2) - 1.0 / (outer * c6)
+    by_kappa = 1.0 / (rho * c1) - 2.0 * half * p2 * (kappa * c - b)
     scale = -1.0 / by_kappa
     return (
         scale * by_a,

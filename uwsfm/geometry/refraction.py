@@ -7,12 +7,12 @@ all rays through a flat port meet the axis along its normal.
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import kernel, lane
 
 MAX_STEPS = 60
 
 
-@kernel
+@lane
 def refract(dx, dy, dz, nx, ny, nz, ratio):
     """Refract a unit direction at a plane, by Snell's law in vector form.
 
@@ -26,17 +26,45 @@ def refract(dx, dy, dz, nx, ny, nz, ratio):
     """
     c = nx * dx + ny * dy + nz * dz
     k = 1.0 - ratio * ratio * (1.0 - c * c)
-    if not k > 0.0:
-        return math.nan, math.nan, math.nan
-    s = math.sqrt(k) - ratio * c
+    s = math.sqrt(k if k > 0.0 else math.nan) - ratio * c
     return ratio * dx + s * nx, ratio * dy + s * ny, ratio * dz + s * nz
 
 
-@kernel
+@lane
 def slope(index, u):
     """s = (n^2 + (n^2 - 1) u)^(-1/2): tan(theta in the layer) / tan(theta in air)."""
     square = index * index
     return 1.0 / math.sqrt(square + (square - 1.0) * u)
+
+
+@lane
+def flat_port_start(low, r2, water2):
+    """A better start than the paraxial root ``low`` of the flat-port equation."""
+    s = 1.0 - (1.0 - 1.0 / water2) * r2 * low * low
+    return low / math.sqrt(s) if s > 0.02 else low
+
+
+@lane
+def flat_port_step(q, low, height, r2, dist, thick, glass2, water2):
+    """One Halley step on the flat-port equation: (q, F before the step).
+
+    Args:
+        q: where F is evaluated.
+        low: the paraxial root, below which the root is not.
+        height, r2, dist, thick: as in `solve_flat_port`.
+        glass2, water2: squared indices relative to air, >= 1.
+    """
+    u = q * q * r2
+    s_g = 1.0 / math.sqrt(glass2 + (glass2 - 1.0) * u)
+    s_w = 1.0 / math.sqrt(water2 + (water2 - 1.0) * u)
+    f = q * (dist + thick * s_g + height * s_w) - 1.0
+    sg2, sw2 = s_g * s_g, s_w * s_w
+    by_glass, by_water = thick * glass2 * sg2 * s_g, height * water2 * sw2 * s_w
+    f1 = dist + by_glass + by_water
+    f2 = by_glass * (glass2 - 1.0) * sg2 + by_water * (water2 - 1.0) * sw2
+    # Uncapped Halley diverges near grazing incidence: cap F F'' at 0.7 F'^2.
+    curvature = min(-3.0 * q * r2 * f2 * f, 0.7 * f1 * f1)
+    return max(q - 2.0 * f * f1 / (2.0 * f1 * f1 - curvature), low), f
 
 
 @kernel
@@ -66,20 +94,10 @@ def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
     if not paraxial > 0.0:
         return math.nan
     q_low = 1.0 / paraxial
-    s = 1.0 - (1.0 - 1.0 / (n_water * n_water)) * r2 * q_low * q_low
-    q = q_low / math.sqrt(s) if s > 0.02 else q_low
     g2, w2 = n_glass * n_glass, n_water * n_water
+    q = flat_port_start(q_low, r2, w2)
     for _ in range(MAX_STEPS):
-        u = q * q * r2
-        s_g, s_w = slope(n_glass, u), slope(n_water, u)
-        f = q * (dist + thick * s_g + height * s_w) - 1.0
-        sg3, sw3 = s_g * s_g * s_g, s_w * s_w * s_w
-        f1 = dist + thick * g2 * sg3 + height * w2 * sw3
-        sg5, sw5 = sg3 * s_g * s_g, sw3 * s_w * s_w
-        f2 = thick * g2 * (g2 - 1.0) * sg5 + height * w2 * (w2 - 1.0) * sw5
-        # Uncapped Halley diverges near grazing incidence: cap F F'' at 0.7 F'^2.
-        curvature = min(-3.0 * q * r2 * f2 * f, 0.7 * f1 * f1)
-        q = max(q - 2.0 * f * f1 / (2.0 * f1 * f1 - curvature), q_low)
+        q, f = flat_port_step(q, q_low, height, r2, dist, thick, g2, w2)
         if abs(f) < 1e-10:  # cubic: the step just taken is exact to rounding
             return q
     return math.nan

@@ -6,7 +6,7 @@ in metres. Failure is a status and NaN.
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import kernel, lane
 from uwsfm.geometry.refraction import refract, slope, solve_flat_port
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.models.status import (
@@ -19,6 +19,24 @@ from uwsfm.models.status import (
 )
 
 
+@lane
+def bent_by_flat(dx, dy, dz, nx, ny, nz, dist, thick, mu_g, mu_w):
+    """Origin on the outer surface (3) and direction in water (3) of a ray in air.
+
+    Paper eq. 1-4. NaN on total reflection; the ray is taken to meet the port.
+
+    Args:
+        dx, dy, dz: unit direction in air.
+        nx, ny, nz, dist, thick: the port.
+        mu_g, mu_w: index of air over that of glass, of glass over that of water.
+    """
+    gx, gy, gz = refract(dx, dy, dz, nx, ny, nz, mu_g)
+    wx, wy, wz = refract(gx, gy, gz, nx, ny, nz, mu_w)
+    a = dist / (nx * dx + ny * dy + nz * dz)
+    b = thick / (nx * gx + ny * gy + nz * gz)
+    return a * dx + b * gx, a * dy + b * gy, a * dz + b * gz, wx, wy, wz
+
+
 @kernel
 def flat_water_ray(dx, dy, dz, port):
     """Refract a finite unit direction in air through the port (paper eq. 1-4).
@@ -27,18 +45,21 @@ def flat_water_ray(dx, dy, dz, port):
         (status, origin on the outer surface (3), unit direction in water (3)).
     """
     nan = math.nan
-    nx, ny, nz = port[0], port[1], port[2]
-    n_air, n_glass, n_water = port[5], port[6], port[7]
-    cos_air = nx * dx + ny * dy + nz * dz
-    if not cos_air > 0.0:
+    nx, ny, nz, mu_g, mu_w = (
+        port[0],
+        port[1],
+        port[2],
+        port[5] / port[6],
+        port[6] / port[7],
+    )
+    if not nx * dx + ny * dy + nz * dz > 0.0:
         return MISSES_PORT, nan, nan, nan, nan, nan, nan
-    gx, gy, gz = refract(dx, dy, dz, nx, ny, nz, n_air / n_glass)
-    wx, wy, wz = refract(gx, gy, gz, nx, ny, nz, n_glass / n_water)
+    ox, oy, oz, wx, wy, wz = bent_by_flat(
+        dx, dy, dz, nx, ny, nz, port[3], port[4], mu_g, mu_w
+    )
     if not abs(wx) < math.inf:
         return TOTAL_REFLECTION, nan, nan, nan, nan, nan, nan
-    a = port[3] / cos_air
-    b = port[4] / (nx * gx + ny * gy + nz * gz)
-    return VALID, a * dx + b * gx, a * dy + b * gy, a * dz + b * gz, wx, wy, wz
+    return VALID, ox, oy, oz, wx, wy, wz
 
 
 @kernel
@@ -63,6 +84,57 @@ def flat_air_ray(x, y, z, port):
     return VALID, q, nx + q * rx, ny + q * ry, nz + q * rz
 
 
+@lane
+def flat_gradient(q, r2, depth, dist, thick, g, w, n_air):
+    """What `flat_jac_row` needs of a root, by the implicit function theorem.
+
+    (A, B, B - z A, 1 - q z, and the factors of L r for d, t, n_glass, n_water).
+    """
+    u = q * q * r2
+    s_g, s_w = slope(g, u), slope(w, u)
+    g3 = thick * s_g * s_g * s_g
+    w3 = (depth - dist - thick) * s_w * s_w * s_w
+    scale = 1.0 / (dist + g * g * g3 + w * w * w3)
+    a = q * q * q * ((g * g - 1.0) * g3 + (w * w - 1.0) * w3) * scale
+    b = -q * s_w * scale
+    bend = q * scale * (1.0 + u) / n_air
+    return (
+        a,
+        b,
+        b - depth * a,
+        1.0 - q * depth,
+        -q * scale * (1.0 - s_w),
+        -q * scale * (s_g - s_w),
+        bend * g * g3,
+        bend * w * w3,
+    )
+
+
+@lane
+def flat_jac_row(lx, ly, lz, rx, ry, rz, q, normal, basis, gradient):
+    """One row of the Jacobian of `flat_jac`, without the column of the radius."""
+    nx, ny, nz = normal
+    t11, t12, t13, t21, t22, t23 = basis
+    a, b, tilt, stretch, by_dist, by_thick, by_glass, by_water = gradient
+    l_r = lx * rx + ly * ry + lz * rz
+    l_n = lx * nx + ly * ny + lz * nz
+    pull = tilt * l_r - q * l_n
+    along_r, along_n = l_r * a, l_r * b - q * l_n
+    return (
+        along_r * rx + along_n * nx + q * lx,
+        along_r * ry + along_n * ny + q * ly,
+        along_r * rz + along_n * nz + q * lz,
+        stretch * (lx * t11 + ly * t12 + lz * t13)
+        + pull * (rx * t11 + ry * t12 + rz * t13),
+        stretch * (lx * t21 + ly * t22 + lz * t23)
+        + pull * (rx * t21 + ry * t22 + rz * t23),
+        l_r * by_dist,
+        l_r * by_thick,
+        l_r * by_glass,
+        l_r * by_water,
+    )
+
+
 @kernel
 def flat_jac(x, y, z, q, port, lens_rows, jac):
     """Jacobian of the pixel of a point, by the implicit function theorem.
@@ -82,35 +154,17 @@ def flat_jac(x, y, z, q, port, lens_rows, jac):
         jac: (2, JAC_SIZE), written.
     """
     nx, ny, nz = port[0], port[1], port[2]
-    dist, thick, n_air = port[3], port[4], port[5]
+    n_air = port[5]
     depth = nx * x + ny * y + nz * z
     rx, ry, rz = x - depth * nx, y - depth * ny, z - depth * nz
     r2 = rx * rx + ry * ry + rz * rz
-    g, w = port[6] / n_air, port[7] / n_air
-    height = depth - dist - thick
-    u = q * q * r2
-    s_g, s_w = slope(g, u), slope(w, u)
-    g3, w3 = thick * s_g**3, height * s_w**3
-    inv_f1 = 1.0 / (dist + g * g * g3 + w * w * w3)
-    a = q**3 * ((g * g - 1.0) * g3 + (w * w - 1.0) * w3) * inv_f1
-    b = -q * s_w * inv_f1
-    tilt, stretch = b - depth * a, 1.0 - q * depth
-    t11, t12, t13, t21, t22, t23 = tangents(nx, ny, nz)
-    rt1 = rx * t11 + ry * t12 + rz * t13
-    rt2 = rx * t21 + ry * t22 + rz * t23
+    gradient = flat_gradient(
+        q, r2, depth, port[3], port[4], port[6] / n_air, port[7] / n_air, n_air
+    )
+    basis = tangents(nx, ny, nz)
     for i in range(2):
         lx, ly, lz = lens_rows[3 * i], lens_rows[3 * i + 1], lens_rows[3 * i + 2]
-        l_r = lx * rx + ly * ry + lz * rz
-        l_n = lx * nx + ly * ny + lz * nz
-        jac[i, 0] = l_r * (a * rx + b * nx) + q * (lx - l_n * nx)
-        jac[i, 1] = l_r * (a * ry + b * ny) + q * (ly - l_n * ny)
-        jac[i, 2] = l_r * (a * rz + b * nz) + q * (lz - l_n * nz)
-        pull = tilt * l_r - q * l_n
-        jac[i, 3] = stretch * (lx * t11 + ly * t12 + lz * t13) + pull * rt1
-        jac[i, 4] = stretch * (lx * t21 + ly * t22 + lz * t23) + pull * rt2
-        scale = l_r * q * inv_f1
-        jac[i, 5] = -scale * (1.0 - s_w)
-        jac[i, 6] = -scale * (s_g - s_w)
-        jac[i, 7] = scale * g * (1.0 + u) * g3 / n_air
-        jac[i, 8] = scale * w * (1.0 + u) * w3 / n_air
+        row = flat_jac_row(lx, ly, lz, rx, ry, rz, q, (nx, ny, nz), basis, gradient)
+        for k in range(9):
+            jac[i, k] = row[k]
         jac[i, 9] = 0.0  # no radius

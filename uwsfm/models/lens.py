@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import kernel, lane
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
@@ -120,33 +120,57 @@ def distort(u, v, lens):
     return _distort_fisheye(u, v, lens)
 
 
-@kernel
-def _distort_brown(u, v, lens):
+@lane
+def coefficients(lens):
+    """Distortion parameters of a row, as a tuple (k1, k2, p1, p2, k3, k4, k5, k6)."""
+    return (
+        lens[4],
+        lens[5],
+        lens[6],
+        lens[7],
+        lens[8],
+        lens[9],
+        lens[10],
+        lens[11],
+    )
+
+
+@lane
+def brown(u, v, params):
+    """Brown's distortion, whatever the range: (x, y) and d(x, y) / d(u, v): 6 scalars.
+
+    The Jacobian is symmetric: (x, y, x_u, x_v, y_v, determinant).
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = params
     s = u * u + v * v
-    if not s < lens[13]:
-        return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
-    p1, p2 = lens[6], lens[7]
-    num = 1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))
-    den = 1.0 + s * (lens[9] + s * (lens[10] + s * lens[11]))
-    num_s = lens[4] + s * (2.0 * lens[5] + s * 3.0 * lens[8])
-    den_s = lens[9] + s * (2.0 * lens[10] + s * 3.0 * lens[11])
-    radial = num / den
-    radial_s = (num_s - radial * den_s) / den
+    num = 1.0 + s * (k1 + s * (k2 + s * k3))
+    inv_den = 1.0 / (1.0 + s * (k4 + s * (k5 + s * k6)))
+    num_s = k1 + s * (2.0 * k2 + s * 3.0 * k3)
+    den_s = k4 + s * (2.0 * k5 + s * 3.0 * k6)
+    radial = num * inv_den
+    radial_s = (num_s - radial * den_s) * inv_den
     x = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
     y = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
     xu = radial + 2.0 * u * u * radial_s + 2.0 * p1 * v + 6.0 * p2 * u
     xv = 2.0 * u * v * radial_s + 2.0 * p1 * u + 2.0 * p2 * v
     yv = radial + 2.0 * v * v * radial_s + 6.0 * p1 * v + 2.0 * p2 * u
-    if not xu * yv - xv * xv > 0.0:  # tangential terms fold it a little earlier
+    return x, y, xu, xv, yv, xu * yv - xv * xv
+
+
+@kernel
+def _distort_brown(u, v, lens):
+    x, y, xu, xv, yv, det = brown(u, v, coefficients(lens))
+    # Tangential terms fold it a little earlier than the limit of the radial ones.
+    if not (u * u + v * v < lens[13] and det > 0.0):
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     return x, y, xu, xv, xv, yv
 
 
-@kernel
-def _fisheye_angle(theta, lens):
+@lane
+def fisheye_angle(theta, params):
     """theta_d and its derivative: theta (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)."""
+    k1, k2, _, _, k3, k4, _, _ = params
     s = theta * theta
-    k1, k2, k3, k4 = lens[4], lens[5], lens[8], lens[9]
     value = theta * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
     slope = 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * 9.0 * k4)))
     return value, slope
@@ -161,7 +185,7 @@ def _distort_fisheye(u, v, lens):
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     if radius < 1e-8:  # theta_d / r = 1 + O(r^2) to rounding
         return u, v, 1.0, 0.0, 0.0, 1.0
-    value, slope = _fisheye_angle(theta, lens)
+    value, slope = fisheye_angle(theta, coefficients(lens))
     scale = value / radius
     # d(scale) / d(radius) / radius
     scale_r = (slope / (1.0 + s) - scale) / s
@@ -285,13 +309,13 @@ def _dir_from_fisheye(xd, yd, lens):
     target = math.sqrt(xd * xd + yd * yd)
     if target < 1e-12:
         return xd, yd, 1.0
-    limit, _ = _fisheye_angle(lens[13], lens)
+    limit, _ = fisheye_angle(lens[13], coefficients(lens))
     if not target < limit:
         return nan, nan, nan
     low, high = 0.0, lens[13]
     theta = min(target, 0.5 * (low + high))
     for _ in range(100):  # monotonic up to the limit: Newton inside a bracket
-        value, slope = _fisheye_angle(theta, lens)
+        value, slope = fisheye_angle(theta, coefficients(lens))
         if value > target:
             high = theta
         else:

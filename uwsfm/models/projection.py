@@ -8,10 +8,28 @@ flat port and a dome do differently is in `flat` and `dome`.
 
 import math
 
+import numpy as np
+
 from uwsfm._jit import kernel
 from uwsfm.models.dome import dome_air_ray, dome_jac, dome_water_ray
+from uwsfm.models.dome_lanes import dome_air_lanes, dome_jac_lanes, dome_ray_lanes
 from uwsfm.models.flat import flat_air_ray, flat_jac, flat_water_ray
+from uwsfm.models.flat_lanes import flat_air_lanes, flat_jac_lanes, flat_ray_lanes
+from uwsfm.models.lanes import (
+    BLOCK,
+    JAC_U,
+    JAC_V,
+    OK,
+    PX,
+    PY,
+    SIZE,
+    STRIDE,
+    VX,
+    X,
+    load_rows,
+)
 from uwsfm.models.lens import dir_from_img, img_from_dir, jac_by_params
+from uwsfm.models.lens_lanes import dir_lanes, img_lanes
 from uwsfm.models.port import DOME, KIND
 from uwsfm.models.status import (
     BEHIND_CAMERA,
@@ -111,18 +129,70 @@ def lens_jac_of_point(x, y, z, lens, port, jac):
 
 
 @kernel
+def air_lanes(port, buffer):
+    """Rays in air of the points of a buffer, see `uwsfm.models.lanes`."""
+    if port[KIND] == DOME:
+        dome_air_lanes(port, buffer)
+    else:
+        flat_air_lanes(port, buffer)
+
+
+@kernel
+def project_lanes(lens, port, buffer):
+    """PX, PY and d(pixel) / dv of points X, Y, Z; lanes that are not OK are undone."""
+    air_lanes(port, buffer)
+    img_lanes(lens, buffer)
+
+
+@kernel
+def jac_lanes(port, buffer):
+    """JAC_SIZE columns of the Jacobian, after `project_lanes`."""
+    if port[KIND] == DOME:
+        dome_jac_lanes(port, buffer)
+    else:
+        flat_jac_lanes(port, buffer)
+
+
+@kernel
+def _unproject_rays(port, buffer):
+    if port[KIND] == DOME:
+        dome_ray_lanes(port, buffer)
+    else:
+        flat_ray_lanes(port, buffer)
+
+
+@kernel
+def _take_rays(first, count, buffer, rays, status):
+    for i in range(count):
+        for k in range(3):
+            rays[first + i, k] = buffer[(X + k) * STRIDE + i]
+            rays[first + i, 3 + k] = buffer[(VX + k) * STRIDE + i]
+        status[first + i] = VALID
+
+
+@kernel
 def unproject_batch(xy, lens, port, rays, status):
-    """Loop of `unproject`: xy (N, 2) -> rays (N, 6), status (N,)."""
-    for i in range(len(xy)):
-        code, ox, oy, oz, wx, wy, wz = unproject(xy[i, 0], xy[i, 1], lens, port)
-        status[i] = code
-        rays[i, 0], rays[i, 1], rays[i, 2] = ox, oy, oz
-        rays[i, 3], rays[i, 4], rays[i, 5] = wx, wy, wz
+    """`unproject` of many: xy (N, 2) -> rays (N, 6), status (N,)."""
+    buffer = np.empty(SIZE)
+    for first in range(0, len(xy), BLOCK):
+        count = min(BLOCK, len(xy) - first)
+        load_rows(xy, first, count, PX, 2, buffer)
+        dir_lanes(lens, buffer)
+        _unproject_rays(port, buffer)
+        _take_rays(first, count, buffer, rays, status)
+        for i in range(count):
+            if buffer[OK * STRIDE + i] == 1.0:
+                continue
+            j = first + i
+            code, ox, oy, oz, wx, wy, wz = unproject(xy[j, 0], xy[j, 1], lens, port)
+            status[j] = code
+            rays[j, 0], rays[j, 1], rays[j, 2] = ox, oy, oz
+            rays[j, 3], rays[j, 4], rays[j, 5] = wx, wy, wz
 
 
 @kernel
 def refract_batch(dirs, port, rays, status):
-    """Loop of `water_ray_from_dir`: unit dirs (N, 3) -> rays (N, 6), status (N,)."""
+    """`water_ray_from_dir` of many: unit dirs (N, 3) -> rays (N, 6), status (N,)."""
     for i in range(len(dirs)):
         code, ox, oy, oz, wx, wy, wz = water_ray_from_dir(
             dirs[i, 0], dirs[i, 1], dirs[i, 2], port
@@ -134,21 +204,42 @@ def refract_batch(dirs, port, rays, status):
 
 @kernel
 def project_batch(points, lens, port, xy, status):
-    """Loop of `project`: points (N, 3) -> xy (N, 2), status (N,)."""
-    for i in range(len(points)):
-        code, px, py = project(points[i, 0], points[i, 1], points[i, 2], lens, port)
-        status[i] = code
-        xy[i, 0], xy[i, 1] = px, py
+    """`project` of many: points (N, 3) -> xy (N, 2), status (N,)."""
+    buffer = np.empty(SIZE)
+    for first in range(0, len(points), BLOCK):
+        count = min(BLOCK, len(points) - first)
+        load_rows(points, first, count, X, 3, buffer)
+        project_lanes(lens, port, buffer)
+        for i in range(count):
+            j = first + i
+            code, px, py = VALID, buffer[PX * STRIDE + i], buffer[PY * STRIDE + i]
+            if buffer[OK * STRIDE + i] != 1.0:
+                code, px, py = project(
+                    points[j, 0], points[j, 1], points[j, 2], lens, port
+                )
+            status[j] = code
+            xy[j, 0], xy[j, 1] = px, py
 
 
 @kernel
 def project_with_jac_batch(points, lens, port, xy, jac, status):
-    """Loop of `project_with_jac`: jac (N, 2, JAC_SIZE), NaN where invalid."""
-    for i in range(len(points)):
-        code, px, py = project_with_jac(
-            points[i, 0], points[i, 1], points[i, 2], lens, port, jac[i]
-        )
-        status[i] = code
-        xy[i, 0], xy[i, 1] = px, py
-        if code != VALID:
-            jac[i] = math.nan
+    """`project_with_jac` of many: jac (N, 2, JAC_SIZE), NaN where invalid."""
+    buffer = np.empty(SIZE)
+    for first in range(0, len(points), BLOCK):
+        count = min(BLOCK, len(points) - first)
+        load_rows(points, first, count, X, 3, buffer)
+        project_lanes(lens, port, buffer)
+        jac_lanes(port, buffer)
+        for i in range(count):
+            j = first + i
+            code, px, py = VALID, buffer[PX * STRIDE + i], buffer[PY * STRIDE + i]
+            for k in range(JAC_SIZE):
+                jac[j, 0, k] = buffer[(JAC_U + k) * STRIDE + i]
+                jac[j, 1, k] = buffer[(JAC_V + k) * STRIDE + i]
+            if buffer[OK * STRIDE + i] != 1.0:
+                jac[j] = math.nan
+                code, px, py = project_with_jac(
+                    points[j, 0], points[j, 1], points[j, 2], lens, port, jac[j]
+                )
+            status[j] = code
+            xy[j, 0], xy[j, 1] = px, py
