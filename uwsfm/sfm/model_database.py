@@ -26,7 +26,7 @@ from uwsfm.sfm.mapping.adjustment import adjust_locally, neighbours
 from uwsfm.sfm.mapping.correspondences import Correspondences, in_rows
 from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.mapping.incremental import MIN_IMAGES
-from uwsfm.sfm.mapping.registration import register_next
+from uwsfm.sfm.mapping.registration import Ranking, register_next
 from uwsfm.sfm.model_start import Tracks
 from uwsfm.sfm.refine import MAX_ERROR_PX, MIN_ANGLE_DEG, Refined
 
@@ -194,13 +194,14 @@ def with_database(
     poses[frames] = scene.rig_from_world[there]
     growing.place(frames, poses)
     growing.retriangulate(MAX_ERROR_PX)
+    ranking = Ranking(growing, MIN_INLIERS)
     while True:
         progress("registering", growing.num_registered, of.num_frames)
-        added = register_next(growing, MAX_ERROR_PX, SEED, MIN_INLIERS)
+        added = register_next(growing, ranking, MAX_ERROR_PX, SEED)
         if added is None:
             break
-        adjust_locally(growing, neighbours(growing, added))
-        growing.filter(MAX_ERROR_PX)
+        points = adjust_locally(growing, neighbours(growing, added))
+        growing.filter(points, MAX_ERROR_PX)
     growing.retriangulate(MAX_ERROR_PX, MIN_IMAGES)
     scene, seen = growing.scene()
     keypoints = [

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import csr_array, triu
 
 from uwsfm.rig import Rig
-from uwsfm.scene import Scene
+from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.background import opened
 from uwsfm.sfm.images import Frames
 
@@ -45,8 +45,11 @@ def write_features(
     images = [
         (c, f) for f in range(len(frames.names)) for c in range(len(frames.folders))
     ]
-    keypoint_of: dict[tuple[int, int], dict[int, int]] = {}
-    image_id = {place: len(images) - i for i, place in enumerate(images)}
+    image_of = scene.frame_idx * len(frames.folders) + scene.camera_idx
+    order = np.argsort(image_of, kind="stable")
+    first = np.searchsorted(image_of[order], np.arange(len(images) + 1))
+    rows_of = [order[first[i] : first[i + 1]] for i in range(len(images))]
+    image_id = [len(images) - i for i in range(len(images))]
     with opened(path) as database, pycolmap.DatabaseTransaction(database):
         for c, camera in enumerate(scene.cameras):
             lens = pycolmap.Camera(
@@ -57,20 +60,27 @@ def write_features(
                 params=camera.camera.params,
             )
             database.write_camera(lens, use_camera_id=True)
-        for c, f in images:
-            rows = np.flatnonzero((scene.camera_idx == c) & (scene.frame_idx == f))
-            points = scene.point_idx[rows].tolist()
-            keypoint_of[c, f] = dict(zip(points, range(len(rows)), strict=True))
-            name, new_id = frames.image_name(c, f), image_id[c, f]
+        for (c, f), rows, new_id in zip(images, rows_of, image_id, strict=True):
+            name = frames.image_name(c, f)
             image = pycolmap.Image(name=name, camera_id=c + 1, image_id=new_id)
             database.write_image(image, use_image_id=True)
             database.write_keypoints(new_id, scene.xy[rows].astype(np.float32))
-        for a, b in combinations(images, 2):
-            common = sorted(keypoint_of[a].keys() & keypoint_of[b].keys())
-            if len(common) < MIN_MATCHES:
-                continue
-            ends = [(keypoint_of[a][p], keypoint_of[b][p]) for p in common]
-            matches = np.array(ends, dtype=np.uint32)
+        for a, b in _overlapping(image_of, scene.point_idx):
+            of_a, of_b = (scene.point_idx[rows_of[i]] for i in (a, b))
+            _, *ends = np.intersect1d(
+                of_a, of_b, assume_unique=True, return_indices=True
+            )
+            matches = np.column_stack(ends).astype(np.uint32)
             bad = np.flatnonzero(rng.random(len(matches)) < wrong)
             matches[bad, 1] = matches[np.roll(bad, 1), 1]  # still one to one
             database.write_matches(image_id[a], image_id[b], matches)
+
+
+def _overlapping(image_of: IndexArray, point_idx: IndexArray) -> list[list[int]]:
+    """Pairs of images that share enough points, in the order of the images."""
+    sees = csr_array((np.ones(len(image_of), dtype=np.int32), (image_of, point_idx)))
+    shared = triu(sees @ sees.T, k=1).tocsr()
+    shared.sort_indices()
+    pairs = shared.tocoo()
+    enough = pairs.data >= MIN_MATCHES
+    return np.column_stack([pairs.row, pairs.col])[enough].tolist()

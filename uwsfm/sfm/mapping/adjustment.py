@@ -76,34 +76,40 @@ class Housings:
 def neighbours(growing: GrowingMap, frame: int) -> IndexArray:
     """A frame and those that share most points with it, without the first of all,
     which holds the place of the world."""
-    scene, _ = growing.scene()
-    shared = np.zeros(scene.num_points, dtype=bool)
-    shared[scene.point_idx[scene.frame_idx == frame]] = True
-    counts = np.bincount(
-        scene.frame_idx[shared[scene.point_idx]], minlength=scene.num_frames
-    )
+    of = growing.correspondences
+    near = growing.chains.of_points(growing.points_of(np.array([frame])))
+    counts = np.bincount(of.frame[near], minlength=of.num_frames)
     counts[np.flatnonzero(growing.registered)[0]] = 0
     order = np.argsort(-counts, kind="stable")[: LOCAL_FRAMES + 1]
     return np.union1d(order[counts[order] > 0], [frame])
 
 
-def adjust_locally(growing: GrowingMap, free: IndexArray) -> None:
-    """Move some frames and the points they see; all else is held."""
-    scene, _ = growing.scene()
-    moving = np.isin(scene.frame_idx, free)
-    part, points = scene.select(np.isin(scene.point_idx, scene.point_idx[moving]))
-    held = np.ones(scene.num_frames, dtype=bool)
-    held[free] = False
-    state = _minimized(part, None, held, LOCAL_ITERATIONS)
+def adjust_locally(growing: GrowingMap, free: IndexArray) -> IndexArray:
+    """Move some frames and the points (n,) they see, which are returned; all else is
+    held."""
+    points = growing.points_of(free)
+    scene = growing.scene_of(growing.chains.of_points(points))
+    frames, frame_idx = np.unique(scene.frame_idx, return_inverse=True)
+    part = replace(
+        scene,
+        points=growing.points[points],
+        point_idx=np.searchsorted(points, scene.point_idx),
+        rig_from_world=growing.rig_from_world[frames],
+        frame_idx=frame_idx.reshape(-1),
+    )
+    state = _minimized(part, None, ~np.isin(frames, free), LOCAL_ITERATIONS)
     growing.points[points] = state.points
-    growing.place(free, state.rig_from_world)
+    growing.rig_from_world[frames] = state.rig_from_world
+    growing.place(free, growing.rig_from_world)
+    return points
 
 
 def adjust_globally(growing: GrowingMap, housings: Housings | None) -> None:
     """Move all frames and points but the first frame; and the housings, if given."""
     scene, _ = growing.scene()
-    state = _minimized(scene, housings, None, GLOBAL_ITERATIONS)
-    growing.points = state.points
+    part, points = scene.select(np.ones(scene.num_observations, dtype=bool))
+    state = _minimized(part, housings, None, GLOBAL_ITERATIONS)
+    growing.points[points] = state.points
     growing.rig_from_world = state.rig_from_world
     moved = state.to_scene(scene)
     growing.set_cameras(moved.cameras, moved.cam_from_rig)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from uwsfm.geometry.rigid3 import Array
@@ -52,6 +52,16 @@ class Correspondences:
         return self.image % self.num_cameras
 
     @cached_property
+    def camera_of_image(self) -> IndexArray:
+        """(I,)"""
+        return np.arange(len(self.first) - 1) % self.num_cameras
+
+    def keypoints_of(self, frame: int) -> IndexArray:
+        """All keypoints of a frame."""
+        ends = self.first[[frame * self.num_cameras, (frame + 1) * self.num_cameras]]
+        return np.arange(*ends)
+
+    @cached_property
     def pair(self) -> IndexArray:
         """(M,) which two images each match joins, numbered from 0."""
         images = self.image[self.matches]
@@ -62,9 +72,30 @@ class Correspondences:
         """Index of keypoints in their own images."""
         return keypoints - self.first[self.image[keypoints]]
 
+    @cached_property
+    def _by_frame(self) -> tuple[IndexArray, IndexArray]:
+        """Matches sorted by the frames that they touch, and where each frame starts."""
+        frames = self.frame[self.matches]
+        other = np.flatnonzero(frames[:, 0] != frames[:, 1])
+        touched = np.concatenate([frames[:, 0], frames[other, 1]])
+        matches = np.concatenate([np.arange(len(frames)), other])
+        order = np.lexsort((matches, touched))
+        start = np.searchsorted(touched[order], np.arange(self.num_frames + 1))
+        return matches[order].astype(np.int64), start
+
     def matches_of(self, frame: int) -> IndexArray:
-        """Indices of the matches that touch a frame."""
-        return np.flatnonzero((self.frame[self.matches] == frame).any(axis=1))
+        """Indices of the matches that touch a frame, rising."""
+        matches, start = self._by_frame
+        return matches[start[frame] : start[frame + 1]]
+
+    @cached_property
+    def linked_frames(self) -> csr_array:
+        """(F, F) how many matches join two frames, in both directions; with itself, a
+        frame has twice its matches."""
+        ends = self.frame[self.matches]
+        a, b = np.concatenate([ends, ends[:, ::-1]]).T
+        ones, shape = np.ones(len(a), dtype=np.int64), 2 * (self.num_frames,)
+        return csr_array((ones, (a, b)), shape=shape)
 
     def tracks(
         self, matches: NDArray[np.bool_] | IndexArray

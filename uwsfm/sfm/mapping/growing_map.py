@@ -12,8 +12,8 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
+from uwsfm.sfm.mapping.observers import Chains, errors_px
 from uwsfm.sfm.mapping.triangulation import Views, match_gaps_px, triangulate
-from uwsfm.solver.state import State
 
 Mask = NDArray[np.bool_]
 
@@ -25,6 +25,9 @@ their raw matches agree with the poses: by chance one in a hundred does."""
 
 class GrowingMap:
     """Which frames are registered where, and which keypoints see which point.
+
+    While frames are added, points that lost their keypoints keep their row; none has
+    after `retriangulate`.
 
     Args:
         correspondences: Keypoints and matches.
@@ -46,7 +49,10 @@ class GrowingMap:
         self.registered = np.zeros(num_frames, dtype=bool)
         self.rig_from_world = np.tile(rigid3.IDENTITY, (num_frames, 1))
         self.points = np.empty((0, 3))
-        self.point_of = np.full(num_keypoints, -1, dtype=np.int64)
+        self.chains = Chains.empty(num_keypoints)
+        self.changes = np.zeros(num_frames, dtype=np.int64)
+        """(F,) counts how often what a frame may see has changed."""
+        self._poses = np.zeros((num_frames * correspondences.num_cameras, 12))
         self._world_rays = np.full((2, num_keypoints, 3), np.nan)
         self._camera_rays = np.full((2, num_keypoints, 3), np.nan)
         self.cameras: tuple[RefractiveCamera, ...] = ()
@@ -60,6 +66,11 @@ class GrowingMap:
         )
 
     @property
+    def point_of(self) -> IndexArray:
+        """(N,) the point that each keypoint sees, or -1."""
+        return self.chains.point_of
+
+    @property
     def num_registered(self) -> int:
         return int(np.count_nonzero(self.registered))
 
@@ -70,6 +81,8 @@ class GrowingMap:
         changed = tuple(cameras) != self.cameras
         self.cameras, self.cam_from_rig = tuple(cameras), cam_from_rig
         if changed:
+            self._lenses = np.array([camera.lens for camera in self.cameras])
+            self._ports = np.array([camera.port.row for camera in self.cameras])
             for c, camera in enumerate(self.cameras):
                 rows = self.correspondences.camera == c
                 self._camera_rays[:, rows] = camera.ray_from_img(
@@ -87,14 +100,17 @@ class GrowingMap:
         self.registered[frames] = True
         self.rig_from_world[frames] = rig_from_world[frames]
         of = self.correspondences
-        for f in frames.tolist():
-            for c in range(of.num_cameras):
-                image = f * of.num_cameras + c
-                rows = slice(of.first[image], of.first[image + 1])
-                world_from_cam = rigid3.inverse(self.cam_from_world(image))
-                origins, dirs = self._camera_rays[:, rows]
-                self._world_rays[0, rows] = rigid3.transform(world_from_cam, origins)
-                self._world_rays[1, rows] = rigid3.rotate(world_from_cam, dirs)
+        images = frames[:, None] * of.num_cameras + np.arange(of.num_cameras)
+        images = images.ravel()
+        poses = self.cam_from_world(images)
+        self._poses[images] = rigid3.matrix_rows(poses)
+        for image, world_from_cam in zip(
+            images.tolist(), rigid3.inverse(poses), strict=True
+        ):
+            rows = slice(of.first[image], of.first[image + 1])
+            origins, dirs = self._camera_rays[:, rows]
+            self._world_rays[0, rows] = rigid3.transform(world_from_cam, origins)
+            self._world_rays[1, rows] = rigid3.rotate(world_from_cam, dirs)
 
     def cam_from_world(self, image: int | IndexArray) -> Array:
         """Poses (..., 7) of registered images."""
@@ -104,13 +120,11 @@ class GrowingMap:
     def views(self) -> Views:
         """Rows for `triangulate`."""
         of = self.correspondences
-        images = np.arange(of.num_frames * of.num_cameras)
-        state = State.from_scene(self.scene()[0])
         return Views(
-            cam_from_world=rigid3.matrix_rows(self.cam_from_world(images)),
-            camera=images % of.num_cameras,
-            lenses=state.lenses,
-            ports=state.ports,
+            cam_from_world=self._poses,
+            camera=of.camera_of_image,
+            lenses=self._lenses,
+            ports=self._ports,
             image=of.image,
             xy=of.xy,
             origins=self._world_rays[0],
@@ -119,19 +133,28 @@ class GrowingMap:
 
     def scene(self) -> tuple[Scene, IndexArray]:
         """All frames and the observations of points, and their keypoints (N',)."""
-        of = self.correspondences
         seen = np.flatnonzero(self.point_of >= 0)
-        scene = Scene(
+        return self.scene_of(seen), seen
+
+    def scene_of(self, keypoints: IndexArray) -> Scene:
+        """All frames and points, and the observations of some keypoints (n,)."""
+        of = self.correspondences
+        return Scene(
             cameras=self.cameras,
             cam_from_rig=self.cam_from_rig,
             rig_from_world=self.rig_from_world,
             points=self.points,
-            camera_idx=of.camera[seen],
-            frame_idx=of.frame[seen],
-            point_idx=self.point_of[seen],
-            xy=of.xy[seen],
+            camera_idx=of.camera[keypoints],
+            frame_idx=of.frame[keypoints],
+            point_idx=self.point_of[keypoints],
+            xy=of.xy[keypoints],
         )
-        return scene, seen
+
+    def points_of(self, frames: IndexArray) -> IndexArray:
+        """The points that some frames see, rising."""
+        of = self.correspondences
+        seen = np.concatenate([self.point_of[of.keypoints_of(f)] for f in frames])
+        return np.unique(seen[seen >= 0])
 
     def counts(self) -> dict[str, float]:
         """For the report."""
@@ -172,7 +195,8 @@ class GrowingMap:
     def retriangulate(self, max_error_px: float, min_images: int = 2) -> None:
         """Find all points anew, from all matches that agree with the poses."""
         self.points = np.empty((0, 3))
-        self.point_of[:] = -1
+        self.chains = Chains.empty(len(self.point_of))
+        self.changes += 1
         everything = np.arange(len(self.correspondences.matches))
         matches = self.consistent(everything, max_error_px)
         self._add_tracks(matches, max_error_px, min_images)
@@ -201,21 +225,21 @@ class GrowingMap:
         order = order[_firsts(keypoints[order])]
         image = of.image[keypoints[order]]
         order = order[_firsts(points[order] * np.int64(len(of.first)) + image)]
-        self.point_of[keypoints[order]] = points[order]
+        self._see(keypoints[order], points[order])
+
+    def _see(self, keypoints: IndexArray, points: IndexArray) -> None:
+        self.chains.link(keypoints, points)
+        self._note_change(keypoints)
+
+    def _note_change(self, keypoints: IndexArray) -> None:
+        """What frames that match these keypoints could see is not known any more."""
+        of = self.correspondences
+        frames = np.unique(of.frame[keypoints])
+        self.changes[np.unique(of.linked_frames[frames].indices)] += 1
 
     def errors_px(self, keypoints: IndexArray, points: IndexArray) -> Array:
         """True pixel errors (n,) of keypoints at points; inf if not visible."""
-        of = self.correspondences
-        in_cam = rigid3.transform(
-            self.cam_from_world(of.image[keypoints]), self.points[points]
-        )
-        errors = np.full(len(keypoints), np.inf)
-        for c, camera in enumerate(self.cameras):
-            rows = np.flatnonzero(of.camera[keypoints] == c)
-            xy, valid = camera.img_from_point(in_cam[rows])
-            miss = np.linalg.norm(xy - of.xy[keypoints[rows]], axis=1)
-            errors[rows] = np.where(valid, miss, np.inf)
-        return errors
+        return errors_px(self.views(), keypoints, self.points[points])
 
     def _add_tracks(
         self, matches: IndexArray, max_error_px: float, min_images: int = 2
@@ -227,34 +251,44 @@ class GrowingMap:
             self.views(), start, keypoints, max_error_px, self.min_angle, min_images
         )
         seen = found.point_of >= 0
-        self.point_of[keypoints[seen]] = len(self.points) + found.point_of[seen]
+        old = len(self.points)
         self.points = np.concatenate([self.points, found.points])
+        self.chains = self.chains.with_room(len(self.points))
+        self._see(keypoints[seen], old + found.point_of[seen])
 
-    def filter(self, max_error_px: float) -> None:
-        """Drop observations that miss their point, and points seen once."""
-        seen = np.flatnonzero(self.point_of >= 0)
-        errors = self.errors_px(seen, self.point_of[seen])
-        self.point_of[seen[errors > max_error_px]] = -1
-        seen = np.flatnonzero(self.point_of >= 0)
-        counts = np.bincount(self.point_of[seen], minlength=len(self.points))
-        kept = counts >= 2
-        new = np.where(kept, np.cumsum(kept) - 1, -1)
-        self.point_of[seen] = new[self.point_of[seen]]
-        self.points = self.points[kept]
+    def filter(self, points: IndexArray, max_error_px: float) -> None:
+        """Drop observations that miss some points (n,), and such of them as are seen
+        once."""
+        seen = self.chains.of_points(points)
+        bad = seen[self.errors_px(seen, self.point_of[seen]) > max_error_px]
+        self.chains.unlink(bad)
+        left = self.chains.of_points(points)
+        _, place, counts = np.unique(
+            self.point_of[left], return_inverse=True, return_counts=True
+        )
+        alone = left[counts[place] < 2]
+        self.chains.unlink(alone)
+        self._note_change(np.concatenate([bad, alone]))
 
-    def visible(self, verified: bool) -> tuple[IndexArray, IndexArray]:
-        """Keypoints of frames not yet registered, and the points they match (n,).
+    def visible(
+        self, frames: IndexArray, verified: bool
+    ) -> tuple[IndexArray, IndexArray]:
+        """Keypoints of frames that are not registered, and the points they match (n,).
 
         Args:
+            frames: Different ones.
             verified: By verified matches only, or by any.
         """
         of = self.correspondences
-        ends = of.matches[of.verified] if verified else of.matches
+        rows = [of.matches_of(f) for f in frames.tolist()]
+        matches = np.concatenate([*rows, np.empty(0, dtype=np.int64)])
+        ends = of.matches[matches[of.verified[matches]] if verified else matches]
         ends = np.concatenate([ends, ends[:, ::-1]])
-        new = ~self.registered[of.frame[ends[:, 0]]]
-        ends = ends[new & (self.point_of[ends[:, 1]] >= 0)]
+        ends = ends[self.point_of[ends[:, 1]] >= 0]
+        # The other end is registered; this one is of the frame that was asked for.
+        ends = ends[~self.registered[of.frame[ends[:, 0]]]]
         keys = ends[:, 0] * len(self.points) + self.point_of[ends[:, 1]]
-        return np.divmod(np.unique(keys), len(self.points))
+        return np.divmod(np.unique(keys), max(len(self.points), 1))
 
 
 def _firsts(keys: IndexArray) -> IndexArray:

@@ -35,7 +35,7 @@ from uwsfm.sfm.mapping.initialization import (
     beginnings,
     start_tolerance_px,
 )
-from uwsfm.sfm.mapping.registration import register_next
+from uwsfm.sfm.mapping.registration import Ranking, register_next
 from uwsfm.sfm.options import StartOptions
 
 MIN_FRAMES_FOR_HOUSINGS = 3
@@ -111,6 +111,7 @@ class _Grower:
         progress: Progress,
     ) -> None:
         self.map = growing
+        self.ranking = Ranking(growing)
         self.rig = rig
         self.max_error_px = max_error_px
         self.seed = seed
@@ -131,11 +132,13 @@ class _Grower:
             self.progress("mapping", growing.num_registered, total)
             added = None
             if growing.num_registered < total:
-                added = register_next(growing, self.max_error_px, self.seed)
+                added = register_next(
+                    growing, self.ranking, self.max_error_px, self.seed
+                )
             count = growing.num_registered
             if added is not None and count < GROWTH * last_global:
-                adjust_locally(growing, neighbours(growing, added))
-                growing.filter(self.max_error_px)
+                points = adjust_locally(growing, neighbours(growing, added))
+                growing.filter(points, self.max_error_px)
             elif count > last_global:
                 self._adjust_all(rounds=1 if added is not None else 2)
                 last_global = count

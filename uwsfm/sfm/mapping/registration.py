@@ -17,36 +17,60 @@ MAX_TRIALS = 2000
 """Of a search: enough for one match in six to be right."""
 
 
-def ranked_frames(
-    growing: GrowingMap,
-    keypoints: IndexArray,
-    points: IndexArray,
-    min_inliers: int = MIN_INLIERS,
-) -> IndexArray:
-    """Frames that see at least ``min_inliers`` points, the best spread ones first.
+class Ranking:
+    """Which frame to register next: scores that follow the map as it changes.
 
     As in COLMAP, a frame scores the cells of its images that points occupy, on grids
-    that become finer; each level weighs its number of cells.
+    that become finer; each level weighs its number of cells. A score is computed again
+    when the map has changed near its frame, and not before.
 
     Args:
         growing: The map.
-        keypoints: (n,) of frames that are not registered.
-        points: (n,) that they match.
-        min_inliers: What a pose will need.
+        min_inliers: Points that a frame has to see: what a pose will need.
     """
-    of = growing.correspondences
-    sizes = np.array([(c.width, c.height) for c in growing.cameras], dtype=np.float64)
-    place = of.xy[keypoints] / sizes[of.camera[keypoints]]
-    score = np.zeros(of.num_frames)
-    for cells in GRID_LEVELS:
-        column, row = np.clip((place * cells).astype(np.int64), 0, cells - 1).T
-        occupied = np.unique(of.image[keypoints] * cells**2 + row * cells + column)
-        frame = occupied // cells**2 // of.num_cameras
-        score += cells**2 * np.bincount(frame, minlength=of.num_frames)
-    pairs = np.unique(np.column_stack([of.frame[keypoints], points]), axis=0)
-    score[np.bincount(pairs[:, 0], minlength=of.num_frames) < min_inliers] = 0.0
-    order = np.argsort(-score, kind="stable")
-    return order[score[order] > 0.0]
+
+    def __init__(self, growing: GrowingMap, min_inliers: int = MIN_INLIERS) -> None:
+        self.map = growing
+        self.min_inliers = min_inliers
+        num_frames = growing.correspondences.num_frames
+        self._scores = {verified: np.zeros(num_frames) for verified in (True, False)}
+        self._changes = {
+            verified: np.full(num_frames, -1) for verified in (True, False)
+        }
+
+    def frames(self, verified: bool) -> IndexArray:
+        """Frames that see enough points, the best spread ones first.
+
+        Args:
+            verified: By verified matches only, or by any.
+        """
+        growing, scores = self.map, self._scores[verified]
+        stale = growing.changes != self._changes[verified]
+        self._changes[verified] = growing.changes.copy()
+        scores[growing.registered] = 0.0
+        frames = np.flatnonzero(stale & ~growing.registered)
+        scores[frames] = self._score(*growing.visible(frames, verified))[frames]
+        order = np.argsort(-scores, kind="stable")
+        return order[scores[order] > 0.0]
+
+    def _score(self, keypoints: IndexArray, points: IndexArray) -> Array:
+        """Of all frames (F,), zero where too few of the keypoints (n,) are."""
+        growing = self.map
+        of = growing.correspondences
+        sizes = np.array([(c.width, c.height) for c in growing.cameras])
+        place = of.xy[keypoints] / sizes[of.camera[keypoints]]
+        score = np.zeros(of.num_frames)
+        for cells in GRID_LEVELS:
+            column, row = np.clip((place * cells).astype(np.int64), 0, cells - 1).T
+            occupied = np.unique(of.image[keypoints] * cells**2 + row * cells + column)
+            frame = occupied // cells**2 // of.num_cameras
+            score += cells**2 * np.bincount(frame, minlength=of.num_frames)
+        pairs = np.unique(of.frame[keypoints] * len(growing.points) + points)
+        counts = np.bincount(
+            pairs // max(len(growing.points), 1), minlength=of.num_frames
+        )
+        score[counts < self.min_inliers] = 0.0
+        return score
 
 
 def find_pose(
@@ -87,34 +111,27 @@ def find_pose(
 
 
 def register_next(
-    growing: GrowingMap,
-    max_error_px: float,
-    seed: int,
-    min_inliers: int = MIN_INLIERS,
+    growing: GrowingMap, ranking: Ranking, max_error_px: float, seed: int
 ) -> int | None:
     """Add the best frame that fits, and its points: by what pinholes verified, or else
     by any match.
 
     Args:
         growing: The map.
+        ranking: Of its frames.
         max_error_px: Of an inlier, true pixels.
         seed: Of the samples.
-        min_inliers: As of `find_pose`.
 
     Returns:
         The frame; None if no other one fits.
     """
     for verified in (True, False):
-        keypoints, points = growing.visible(verified)
-        frame_of = growing.correspondences.frame[keypoints]
-        for frame in ranked_frames(growing, keypoints, points, min_inliers).tolist():
-            rows = frame_of == frame
-            seen = keypoints[rows], points[rows]
-            pose = find_pose(growing, *seen, max_error_px, seed, min_inliers)
+        for frame in ranking.frames(verified).tolist():
+            seen = growing.visible(np.array([frame]), verified)
+            pose = find_pose(growing, *seen, max_error_px, seed, ranking.min_inliers)
             if pose is not None:
-                poses = growing.rig_from_world.copy()
-                poses[frame] = pose
-                growing.place(np.array([frame]), poses)
+                growing.rig_from_world[frame] = pose
+                growing.place(np.array([frame]), growing.rig_from_world)
                 growing.extend(frame, max_error_px)
                 return frame
     return None
