@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from uwsfm.sfm.images import Frames
+from uwsfm.sfm.match_blocks import match_block, pair_blocks
 from uwsfm.sfm.matching import frame_pairs, image_pairs
 from uwsfm.sfm.options import MatchOptions
 
@@ -45,3 +47,41 @@ def test_strategy_follows_the_number_of_frames():
     few, many = (len(list(frame_pairs(n, MatchOptions()))) for n in (60, 61))
     assert few == 60 * 61 // 2
     assert many < few
+
+
+@pytest.mark.parametrize("num_threads", [1, 2, 4])
+def test_blocks_hold_every_pair_once_and_little_else(num_threads):
+    """An index per image and block is the price; a thread without work, too."""
+    images = range(200)
+    near = [(a, b) for a in images for b in range(a + 1, min(a + 20, 200))]
+    loops = [(a, a + 100) for a in range(0, 100, 7)]
+    blocks = pair_blocks(near + loops, images, num_threads)
+    assert sorted(p for block in blocks for p in block) == sorted(near + loops)
+    assert len(blocks) >= num_threads
+    indices = sum(len({i for pair in block for i in pair}) for block in blocks)
+    assert indices < 3 * len(images)
+    # Few images still occupy every thread, to the same extent.
+    small = pair_blocks([(a, b) for a in range(28) for b in range(a)], range(28), 2)
+    assert max(map(len, small)) <= 0.55 * sum(map(len, small))
+
+
+def test_matches_do_not_depend_on_the_block(tmp_path):
+    """COLMAP searches approximately: a pair's order matters, its block does not."""
+    rng = np.random.default_rng(5)
+    scene = rng.integers(0, 80, (900, 128))
+    views = {
+        i: np.clip(
+            scene[rng.permutation(900)[:700]] + rng.integers(-9, 9, (700, 128)), 0, 255
+        )
+        for i in (7, 3, 5, 1)
+    }
+    descriptors = {i: view.astype(np.uint8) for i, view in views.items()}
+    pairs = [(7, 3), (7, 5), (5, 1), (1, 3)]
+    together = match_block(descriptors, pairs, tmp_path)
+    for pair, matches in zip(pairs, together, strict=True):
+        (alone,) = match_block(descriptors, [pair], tmp_path)
+        np.testing.assert_array_equal(alone, matches)
+        a, b = (views[i][matches[:, k]] for k, i in enumerate(pair))
+        assert len(matches) > 300  # of about 544 common rows
+        assert np.mean(np.abs(a.astype(int) - b).max(axis=1) <= 18) > 0.99
+    assert list(tmp_path.iterdir()) == []

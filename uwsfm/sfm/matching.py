@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import pycolmap
 
-from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
-from uwsfm.sfm.background import opened, run_with_database
+from uwsfm.sfm import background
+from uwsfm.sfm.background import opened, quiet_colmap
 from uwsfm.sfm.images import Frames
+from uwsfm.sfm.match_blocks import Matches, Pair, match_block, pair_blocks
 from uwsfm.sfm.options import MatchOptions, thread_count
 from uwsfm.sfm.paper_matching import match_pairs
-
-BLOCK_SIZE = 200  # pairs between two looks at Ctrl-C
 
 
 def frame_pairs(num_frames: int, options: MatchOptions) -> Iterator[tuple[int, int]]:
@@ -59,7 +60,7 @@ def match_features(
         database_path: Receives the matches.
         options: Which pairs, and how.
         seed: Of the paper's matcher; COLMAP's takes none.
-        num_threads: Of the paper's matcher, -1 for all cores; COLMAP's takes one.
+        num_threads: -1 for all cores. The matches do not depend on it.
         progress: Called with the step "matching".
     """
     pairs = image_pairs(frames, options)
@@ -73,44 +74,70 @@ def match_features(
             progress=progress,
         )
     else:
-        _match_with_colmap(pairs, database_path, progress)
+        _match_with_colmap(
+            frames, pairs, database_path, thread_count(num_threads), progress
+        )
     progress("matching", len(pairs), len(pairs))
 
 
 def _match_with_colmap(
+    frames: Frames,
     pairs: list[tuple[str, str]],
     database_path: Path,
+    num_threads: int,
     progress: Progress,
 ) -> None:
-    list_path = database_path.parent / "pairs.txt"
-    with replaced_file(list_path) as partial:
-        partial.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    # Two threads share the indices of descriptors, and in one run of twenty they lose
-    # up to half of the matches of some pairs (COLMAP 4.2, FAISS on the CPU).
-    matching.num_threads = 1
-    matching.skip_geometric_verification = True
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = list_path
-    pairing.block_size = BLOCK_SIZE
-
-    def match(token: pycolmap.CancellationToken) -> None:
-        pycolmap.match_image_pairs(
-            database_path,
-            matching_options=matching,
-            pairing_options=pairing,
-            device=pycolmap.Device.cpu,
-            cancellation_token=token,
+    """Blocks of pairs, each in a thread of its own; each is kept when it is done."""
+    with opened(database_path) as database, quiet_colmap():
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        todo = [
+            (ids[a], ids[b])
+            for a, b in pairs
+            if not database.exists_matches(ids[a], ids[b])
+        ]
+        blocks = pair_blocks(
+            todo, [ids[name] for name in frames.image_names()], num_threads
         )
+        counts = [0] * len(blocks)
+        stopped = threading.Event()
 
-    run_with_database(
-        database_path,
-        match,
-        lambda database: progress(
-            "matching", database.num_matched_image_pairs(), len(pairs)
-        ),
-    )
+        def matched(k: int) -> list[Matches]:
+            def watch(done: int) -> None:
+                if stopped.is_set():
+                    raise InterruptedError
+                counts[k] = done
+
+            watch(0)
+            used = {image for pair in blocks[k] for image in pair}
+            with access:
+                descriptors = {i: database.read_descriptors(i).data for i in used}
+            return match_block(descriptors, blocks[k], database_path.parent, watch)
+
+        access = threading.Lock()  # to the connection, which is not for two threads
+        before = len(pairs) - len(todo)
+        with ThreadPoolExecutor(num_threads) as pool:
+            waiting = {pool.submit(matched, k): k for k in range(len(blocks))}
+            try:
+                while waiting:
+                    done, _ = wait(
+                        waiting,
+                        timeout=background.POLL_SECONDS,
+                        return_when=FIRST_COMPLETED,
+                    )
+                    for job in done:
+                        block = blocks[waiting.pop(job)]
+                        with access:
+                            _write_matches(database, block, job.result())
+                    progress("matching", before + sum(counts), len(pairs))
+            finally:
+                stopped.set()
+
+
+def _write_matches(
+    database: pycolmap.Database, pairs: list[Pair], found: list[Matches]
+) -> None:
+    for (a, b), matches in zip(pairs, found, strict=True):
+        database.write_matches(a, b, matches)  # none too: the pair is done
 
 
 def clear_matches(database_path: Path) -> None:

@@ -124,7 +124,7 @@ class StartOptions:
     in every step."""
     seed: int = 0
     num_threads: int = -1
-    """-1: all cores. Matching and mapping take one, so that they are repeatable."""
+    """-1: all cores. COLMAP's mapper takes one, so that it is repeatable."""
 
     def __post_init__(self) -> None:
         if self.mapper not in get_args(Mapper):
