@@ -20,6 +20,7 @@ from uwsfm.cli_options import (
     PriorOption,
     RefineOption,
     SceneDistanceOption,
+    SchedulerOption,
     lever_arm_of,
     priors_of,
     wanted_of,
@@ -122,6 +123,15 @@ def reconstruct(
         int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
     ] = 0,
     threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+    submap_frames: Annotated[
+        int | None,
+        typer.Option(
+            help="Longer surveys are mapped in parts of at most so many frames; "
+            "default: 200 beyond 400.",
+            show_default=False,
+        ),
+    ] = None,
+    scheduler: SchedulerOption = "local",
 ) -> None:
     """Reconstruct a dive: images and a rig file in, a metric model out.
 
@@ -146,6 +156,8 @@ def reconstruct(
             scene_distance_m=scene_distance,
             seed=seed,
             num_threads=threads,
+            submap_frames=submap_frames,
+            scheduler=scheduler,
             progress=progress,
             **wanted_of(also or ()),
             **priors_of(prior or ()),

@@ -47,6 +47,14 @@ SceneDistanceOption = Annotated[
         metavar="METRES", help="Of one camera's scene, about: no baseline tells."
     ),
 ]
+SchedulerOption = Annotated[
+    str,
+    typer.Option(
+        metavar="local|tcp://HOST:PORT",
+        help="Who works in parallel: processes here, or the workers of a Dask "
+        "scheduler, which must see all folders under the same paths.",
+    ),
+]
 PositionsOption = Annotated[
     Path | None,
     typer.Option(

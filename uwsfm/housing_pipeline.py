@@ -43,8 +43,9 @@ from uwsfm.sfm.model_start import ModelStart, start_from_model
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.refine import refine_scene, rig_options
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
-from uwsfm.sfm.start import Workspace, match_images, perspective_start
+from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
+from uwsfm.sfm.workspace import Workspace
 
 Start = Literal["virtual", "paper", "pairs"]
 

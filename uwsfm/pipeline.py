@@ -44,6 +44,7 @@ from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.options import (
     FeatureOptions,
     Mapper,
+    MappingOptions,
     Matcher,
     Matching,
     MatchOptions,
@@ -53,6 +54,7 @@ from uwsfm.sfm.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
+from uwsfm.tasks import LOCAL
 
 WORK = "uwsfm-work"
 """Folder inside the output folder where the steps keep their results."""
@@ -88,6 +90,8 @@ def reconstruct(
     scene_distance_m: float = 1.0,
     seed: int = 0,
     num_threads: int = -1,
+    submap_frames: int | None = None,
+    scheduler: str = LOCAL,
     progress: Progress = silent,
     **calibration: Any,
 ) -> ReconstructResult:
@@ -114,7 +118,11 @@ def reconstruct(
         lengths: YAML file of scale bars and distances between frames, see there.
         scene_distance_m: Of a single camera, about; two or more measure it.
         seed: Of all random choices.
-        num_threads: -1 for all cores.
+        num_threads: -1 for all cores; as many processes map the parts of a survey.
+        submap_frames: A survey of more frames is mapped in parts of at most so many,
+            which are merged; None: in parts of 200 beyond 400.
+        scheduler: Who maps the parts: "local", or the address of a Dask scheduler whose
+            workers see ``images`` and ``out`` under the same paths.
         progress: Called with each long step.
         **calibration: Fields of `CalibrateOptions`, of the last adjustment.
 
@@ -130,10 +138,12 @@ def reconstruct(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)
         ),
         matching=MatchOptions(strategy=matching, matcher=matcher),
+        mapping=MappingOptions(submap_frames=submap_frames),
         mapper=mapper,
         scene_distance_m=scene_distance_m,
         seed=seed,
         num_threads=num_threads,
+        scheduler=scheduler,
     )
     # Wrong folders and files fail before anything is written.
     frames = find_frames(Path(images), rig)

@@ -14,6 +14,8 @@ Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]
 Mapper = Literal["pinhole", "refractive"]
 
+MIN_SUBMAP = 10
+"""Frames: of fewer no housing can be told."""
 MAX_SEED = 2**31 - 1  # COLMAP takes 32 bits
 
 
@@ -106,6 +108,16 @@ class MappingOptions:
     the refractive model, which filters again."""
     min_angle_deg: float = 1.5
     """Between the rays of a point."""
+    submap_frames: int | None = None
+    """Of the refractive mapper: the most frames of a part that is mapped by itself,
+    without those it shares with its neighbours. None: 200 if there are more than 400
+    frames, else all of them in one piece."""
+
+    def __post_init__(self) -> None:
+        if self.submap_frames is not None and self.submap_frames < MIN_SUBMAP:
+            raise InputError(
+                f"submap_frames must be at least {MIN_SUBMAP}, got {self.submap_frames}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +137,9 @@ class StartOptions:
     seed: int = 0
     num_threads: int = -1
     """-1: all cores. COLMAP's mapper takes one, so that it is repeatable."""
+    scheduler: str = "local"
+    """Who does what can be done in parallel: processes of this machine, or the address
+    of a Dask scheduler; see `uwsfm.tasks`."""
 
     def __post_init__(self) -> None:
         if self.mapper not in get_args(Mapper):

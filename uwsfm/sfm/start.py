@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,62 +18,23 @@ from uwsfm._progress import Progress, silent
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
-from uwsfm.sfm.features import ENHANCED, extract_features, store_intrinsics
-from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary, turned_to
+from uwsfm.sfm.features import extract_features, store_intrinsics
+from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
 from uwsfm.sfm.images import Frames, check_images, check_masks, find_frames
 from uwsfm.sfm.mapper import map_images
-from uwsfm.sfm.mapping.correspondences import read_correspondences
-from uwsfm.sfm.mapping.incremental import map_incrementally
-from uwsfm.sfm.mapping.refractive_start import (
-    RefractiveStart,
-    load_refractive_start,
-    write_refractive_start,
-)
+from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
 from uwsfm.sfm.options import FeatureOptions, StartOptions
+from uwsfm.sfm.parallel import workers_of
 from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
-from uwsfm.sfm.refine import rig_options
+from uwsfm.sfm.refractive_steps import map_refractively
 from uwsfm.sfm.steps import Steps
+from uwsfm.sfm.workspace import Workspace
+from uwsfm.tasks import Workers
 
 Start = PerspectiveStart | RefractiveStart
 """Where mapping ended, by the mapper that was asked for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Workspace:
-    """Where the steps keep their results."""
-
-    work_dir: Path
-
-    @property
-    def features(self) -> Path:
-        """Keypoints, descriptors and raw matches of the real images."""
-        return self.work_dir / "database.db"
-
-    @property
-    def enhanced(self) -> Path:
-        return self.work_dir / ENHANCED
-
-    @property
-    def rig(self) -> Path:
-        """The rig derived from a baseline length."""
-        return self.work_dir / "rig.json"
-
-    @property
-    def mapping(self) -> Path:
-        """Virtual keypoints and verified matches."""
-        return self.work_dir / "mapping.db"
-
-    @property
-    def perspective(self) -> Path:
-        """The perspective model."""
-        return self.work_dir / "perspective"
-
-    @property
-    def refractive(self) -> Path:
-        """The map of the refraction-aware mapper."""
-        return self.work_dir / "refractive"
 
 
 def perspective_start(
@@ -103,8 +64,9 @@ def perspective_start(
     options = options or StartOptions()
     frames = find_frames(Path(image_dir), rig)
     steps, space = Steps(Path(work_dir)), Workspace(work_dir=Path(work_dir))
-    key = match_images(rig, frames, steps, space, options, progress)
-    return start_from_matches(rig, frames, steps, key, options, progress)
+    with workers_of(options, space.work_dir) as workers:
+        key = match_images(rig, frames, steps, space, options, progress)
+        return start_from_matches(rig, frames, steps, key, options, progress, workers)
 
 
 def start_from_matches(
@@ -114,6 +76,7 @@ def start_from_matches(
     key: str,
     options: StartOptions,
     progress: Progress = silent,
+    workers: Workers | None = None,
 ) -> Start:
     """`perspective_start`, from a workspace whose database holds raw matches.
 
@@ -124,6 +87,7 @@ def start_from_matches(
         key: Fingerprint of what the matches depend on.
         options: How.
         progress: Called with each long step.
+        workers: Who maps the parts of a long survey; those of the options by default.
 
     Raises:
         InputError: the rig contradicts the matches.
@@ -163,13 +127,9 @@ def start_from_matches(
     key = steps.run("verification", [key, geometry], verify, outputs=[space.mapping])
     start: Start
     if options.mapper == "refractive":
-        steps.run(
-            "mapping",
-            [key, "refractive", asdict(options.mapping), _refined_content(rig)],
-            lambda: _map_refractive(rig, frames, fixed(), space, options, progress),
-            outputs=[space.refractive],
+        start = map_refractively(
+            rig, frames, steps, key, fixed, options, progress, workers
         )
-        start = load_refractive_start(space.refractive, space.features, frames)
     else:
         steps.run(
             "mapping",
@@ -265,14 +225,6 @@ def _rig_content(rig: Rig) -> list[Any]:
     return [rows, None if poses is None else poses.tolist(), rig.baseline_m]
 
 
-def _refined_content(rig: Rig) -> list[Any]:
-    """What the refractive mapper may refine, and which pixels it may use, JSON."""
-    return [
-        rig_options(rig),
-        [camera.valid_radius_px for camera in rig.cameras],
-    ]
-
-
 def _derive_rig(
     rig: Rig,
     frames: Frames,
@@ -333,29 +285,3 @@ def _scale_to(model: pycolmap.Reconstruction, scene_distance_m: float) -> None:
         depths.append(points @ pose.rotation.matrix()[2] + pose.translation[2])
     scale = scene_distance_m / float(np.median(np.concatenate(depths)))
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
-
-
-def _map_refractive(
-    rig: Rig,
-    frames: Frames,
-    fixed: FixedRig,
-    space: Workspace,
-    options: StartOptions,
-    progress: Progress,
-) -> None:
-    maps = map_incrementally(
-        read_correspondences(space.features, space.mapping, frames, rig),
-        rig,
-        fixed.rotation.cam_from_rig,
-        options,
-        progress,
-    )
-    best = maps[0]
-    ended = turned_to(fixed, best.cam_from_rig)
-    registered = {frames.names[f] for f in np.flatnonzero(best.registered)}
-    others = [int(other.registered.sum()) for other in maps[1:]]
-    summary = {
-        **best.counts(),
-        **mapping_summary(rig, frames, ended, registered, others),
-    }
-    write_refractive_start(space.refractive, best, summary)

@@ -90,9 +90,13 @@ class Correspondences:
 
     @cached_property
     def linked_frames(self) -> csr_array:
-        """(F, F) how many matches join two frames, in both directions; with itself, a
-        frame has twice its matches."""
-        ends = self.frame[self.matches]
+        """`links` by any matches."""
+        return self.links(np.ones(len(self.matches), dtype=bool))
+
+    def links(self, chosen: NDArray[np.bool_]) -> csr_array:
+        """(F, F) how many of some matches (M,) join two frames, in both directions;
+        with itself, a frame has twice its matches."""
+        ends = self.frame[self.matches[chosen]]
         a, b = np.concatenate([ends, ends[:, ::-1]]).T
         ones, shape = np.ones(len(a), dtype=np.int64), 2 * (self.num_frames,)
         return csr_array((ones, (a, b)), shape=shape)

@@ -87,7 +87,7 @@ def map_incrementally(
         for beginning in ways:
             num_tried += 1
             growing = empty.emptied()
-            _Grower(growing, rig, tolerance, options.seed, progress).grow(beginning)
+            Grower(growing, rig, tolerance, options.seed, progress).grow(beginning)
             left &= ~growing.registered
             if growing.num_registered > 1:
                 maps.append(growing)
@@ -99,7 +99,7 @@ def map_incrementally(
     return sorted(maps, key=lambda m: -m.num_registered)
 
 
-class _Grower:
+class Grower:
     """Grows one map."""
 
     def __init__(

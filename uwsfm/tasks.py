@@ -1,0 +1,263 @@
+"""Independent pieces of work, here or on the workers of a Dask cluster.
+
+Dask (`dask.distributed`) carries, repeats and counts the tasks. A task is a function of
+a module and its arguments; what is large goes through files of a folder that all
+workers see, written beside their place and renamed: a task that is done twice, because
+its worker died, does no harm.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from uwsfm._progress import Progress, silent
+from uwsfm.errors import InputError, UwsfmError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
+logging.getLogger("distributed").setLevel(logging.WARNING)
+
+LOCAL = "local"
+RETRIES = 2
+"""Of a task that fails for another reason than its input: a full disk, say."""
+CONNECT_SECONDS = 10
+BYTES_PER_WORKER = 1.5e9
+"""That a submap of 200 frames with 4000 features per image needs at its peak, about."""
+
+
+class Workers:
+    """Where tasks run.
+
+    Args:
+        scheduler: "local": processes of this machine, which start when there is more
+            than one task for them; or the address of a Dask scheduler.
+        folder: Through which tasks exchange files. The workers of a scheduler elsewhere
+            must see it under the same path.
+        max_processes: Of this machine; one is this process itself. None: as many as
+            there are cores, and memory for.
+
+    Raises:
+        InputError: an address that is none, no scheduler or no worker there, or a
+            worker that does not see the folder.
+    """
+
+    def __init__(
+        self,
+        scheduler: str = LOCAL,
+        folder: Path | None = None,
+        max_processes: int | None = None,
+    ) -> None:
+        self.scheduler = scheduler
+        self._processes = local_workers()
+        if max_processes is not None:
+            self._processes = min(self._processes, max_processes)
+        self._folder = folder
+        self._client: Client | None = None
+        self._resources = ExitStack()
+        if scheduler != LOCAL and "://" not in scheduler:
+            raise InputError(
+                f"scheduler must be 'local' or an address as tcp://host:8786, got "
+                f"{scheduler!r}"
+            )
+        if self.elsewhere:
+            self._connect()
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._resources.close()
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether a scheduler was named."""
+        return self.scheduler != LOCAL
+
+    def run(
+        self,
+        function: Callable[..., Result],
+        arguments: Sequence[tuple[Any, ...]],
+        step: str,
+        progress: Progress = silent,
+    ) -> list[Result]:
+        """``[function(*a) for a in arguments]``, in any order.
+
+        Args:
+            function: One that may be called twice with the same arguments.
+            arguments: Of each task; picklable, and small.
+            step: Name for the progress, in tasks.
+            progress: Called with it.
+
+        Raises:
+            UwsfmError: what the first task that failed so raised; or a task lost its
+                worker again and again.
+        """
+        progress(step, 0, len(arguments))
+        if not self.elsewhere and min(len(arguments), self._processes) < 2:
+            results = []
+            for done, each in enumerate(arguments, start=1):
+                results.append(function(*each))
+                progress(step, done, len(arguments))
+            return results
+        return self._run_with_dask(function, arguments, step, progress)
+
+    def _run_with_dask(
+        self,
+        function: Callable[..., Result],
+        arguments: Sequence[tuple[Any, ...]],
+        step: str,
+        progress: Progress,
+    ) -> list[Result]:
+        import cloudpickle
+        from distributed import as_completed
+        from distributed.client import FutureCancelledError
+        from distributed.scheduler import KilledWorker
+
+        client = self._client or self._start_processes()
+        paths = [] if self.elsewhere else sys.path
+        futures = client.map(
+            _call,
+            [(paths, cloudpickle.dumps((function, each))) for each in arguments],
+            key=[f"{step}-{os.urandom(8).hex()}" for _ in arguments],
+            retries=RETRIES,
+            pure=False,
+        )
+        place = {future.key: index for index, future in enumerate(futures)}
+        results: dict[int, Any] = {}
+        try:
+            for future in as_completed(futures):
+                result = future.result()
+                if isinstance(result, UwsfmError):
+                    raise result
+                results[place[future.key]] = result
+                progress(step, len(results), len(arguments))
+        except KilledWorker:
+            raise UwsfmError(
+                f"{step}: a task lost its worker {RETRIES + 2} times, for want of "
+                "memory perhaps: give it more, or fewer workers"
+            ) from None
+        except FutureCancelledError:
+            raise UwsfmError(f"{step}: the scheduler went away") from None
+        finally:
+            client.cancel(futures)
+        return [results[index] for index in range(len(arguments))]
+
+    def _start_processes(self) -> Client:
+        """A cluster of processes of one thread each, which end with this object.
+
+        They are started by command line: a process that is spawned from here would run
+        the caller's script again.
+        """
+        import dask
+        from distributed import Client, LocalCluster, SubprocessCluster
+
+        logger.info("starting %d worker processes", self._processes)
+        scratch = self._resources.enter_context(
+            tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
+        )
+        start: Any = LocalCluster if sys.platform == "win32" else SubprocessCluster
+        with dask.config.set({"temporary-directory": scratch}):
+            cluster = start(
+                n_workers=self._processes,
+                threads_per_worker=1,
+                dashboard_address=None,
+                silence_logs=logging.ERROR,
+                worker_kwargs={
+                    "local_directory": scratch,
+                    "env": {"NUMBA_NUM_THREADS": "1"},
+                },
+            )
+        self._resources.callback(cluster.close)
+        self._client = Client(cluster)
+        self._resources.callback(self._client.close)
+        return self._client
+
+    def _connect(self) -> None:
+        from distributed import Client
+
+        with _quiet_dask():
+            try:
+                client = Client(self.scheduler, timeout=CONNECT_SECONDS)
+            except (OSError, ValueError) as error:
+                raise InputError(
+                    f"no Dask scheduler answers at {self.scheduler}: "
+                    f"{str(error).splitlines()[0]}"
+                ) from None
+        self._resources.callback(client.close)
+        try:
+            self._check_workers(client)
+        except BaseException:
+            self._resources.close()
+            raise
+        self._client = client
+
+    def _check_workers(self, client: Client) -> None:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise InputError(f"the Dask scheduler at {self.scheduler} has no worker")
+        if self._folder is None:
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=self._folder, prefix="seen-") as file:
+            try:
+                seen = client.run(_sees, file.name)
+            except ImportError as error:
+                raise InputError(
+                    f"a worker of {self.scheduler} cannot import uwsfm: {error}"
+                ) from None
+        for worker, there in seen.items():
+            if not there:
+                raise InputError(
+                    f"worker {worker} does not see the folder "
+                    f"{self._folder.resolve()}: give one that every worker has under "
+                    "the same path"
+                )
+
+
+def local_workers() -> int:
+    """How many processes this machine has room for."""
+    import psutil
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    free = int(psutil.virtual_memory().available / BYTES_PER_WORKER)
+    return max(1, min(cores or os.cpu_count() or 1, free))
+
+
+def _call(packed: tuple[list[str], bytes]) -> Any:
+    """What a worker does. Wrong input comes back as a result: no use to try again."""
+    paths, task = packed
+    sys.path.extend(path for path in paths if path not in sys.path)
+    import numpy  # noqa: F401  before pycolmap, which unpickling may import
+    from threadpoolctl import threadpool_limits
+
+    function, arguments = pickle.loads(task)
+    with threadpool_limits(1):
+        try:
+            return function(*arguments)
+        except UwsfmError as error:
+            return error
+
+
+def _sees(path: str) -> bool:
+    return os.path.exists(path)
+
+
+def _quiet_dask() -> ExitStack:
+    """Failures to connect are told once, by us."""
+    stack = ExitStack()
+    for name in ("distributed.comm", "distributed.client", "distributed.batched"):
+        log = logging.getLogger(name)
+        stack.callback(log.setLevel, log.level)
+        log.setLevel(logging.CRITICAL)
+    return stack
