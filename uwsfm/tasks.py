@@ -43,8 +43,7 @@ class Workers:
     Args:
         scheduler: "local": processes of this machine, which start when there is more
             than one task for them; or the address of a Dask scheduler.
-        folder: Through which tasks exchange files. The workers of a scheduler elsewhere
-            must see it under the same path.
+        folder: Through which tasks exchange files; see `require_sight`.
         max_processes: Of this machine; one is this process itself. None: as many as
             there are cores, and memory for.
 
@@ -60,9 +59,9 @@ class Workers:
         max_processes: int | None = None,
     ) -> None:
         self.scheduler = scheduler
-        self._processes = local_workers()
+        self.num_processes = local_workers()
         if max_processes is not None:
-            self._processes = min(self._processes, max_processes)
+            self.num_processes = min(self.num_processes, max_processes)
         self._folder = folder
         self._client: Client | None = None
         self._resources = ExitStack()
@@ -105,7 +104,7 @@ class Workers:
                 worker again and again.
         """
         progress(step, 0, len(arguments))
-        if not self.elsewhere and min(len(arguments), self._processes) < 2:
+        if not self.elsewhere and min(len(arguments), self.num_processes) < 2:
             results = []
             for done, each in enumerate(arguments, start=1):
                 results.append(function(*each))
@@ -163,14 +162,14 @@ class Workers:
         import dask
         from distributed import Client, LocalCluster, SubprocessCluster
 
-        logger.info("starting %d worker processes", self._processes)
+        logger.info("starting %d worker processes", self.num_processes)
         scratch = self._resources.enter_context(
             tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
         )
         start: Any = LocalCluster if sys.platform == "win32" else SubprocessCluster
         with dask.config.set({"temporary-directory": scratch}):
             cluster = start(
-                n_workers=self._processes,
+                n_workers=self.num_processes,
                 threads_per_worker=1,
                 dashboard_address=None,
                 silence_logs=logging.ERROR,
@@ -206,22 +205,32 @@ class Workers:
     def _check_workers(self, client: Client) -> None:
         if not client.scheduler_info(n_workers=-1)["workers"]:
             raise InputError(f"the Dask scheduler at {self.scheduler} has no worker")
-        if self._folder is None:
-            return
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=self._folder, prefix="seen-") as file:
-            try:
-                seen = client.run(_sees, file.name)
-            except ImportError as error:
-                raise InputError(
-                    f"a worker of {self.scheduler} cannot import uwsfm: {error}"
-                ) from None
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self._folder, prefix="seen-") as file:
+                self._check_sight(client, Path(file.name), self._folder)
+
+    def require_sight(self, path: Path) -> None:
+        """See to it that all workers have a file or folder under the same path.
+
+        Raises:
+            InputError: one has not; names it.
+        """
+        if self.elsewhere and self._client is not None:
+            self._check_sight(self._client, path, path)
+
+    def _check_sight(self, client: Client, path: Path, named: Path) -> None:
+        try:
+            seen = client.run(_sees, str(path.absolute()))
+        except ImportError as error:
+            raise InputError(
+                f"a worker of {self.scheduler} cannot import uwsfm: {error}"
+            ) from None
         for worker, there in seen.items():
             if not there:
                 raise InputError(
-                    f"worker {worker} does not see the folder "
-                    f"{self._folder.resolve()}: give one that every worker has under "
-                    "the same path"
+                    f"worker {worker} does not see {named.absolute()}: every worker "
+                    "must have it under the same path"
                 )
 
 

@@ -40,6 +40,19 @@ def extract_features(
     Raises:
         InputError: COLMAP cannot read an image; names it.
     """
+    extract_images(frames, rig, database_path, options, num_threads, progress)
+    check_complete(frames, database_path)
+
+
+def extract_images(
+    frames: Frames,
+    rig: Rig,
+    database_path: Path,
+    options: FeatureOptions,
+    num_threads: int = -1,
+    progress: Progress = silent,
+) -> None:
+    """`extract_features` of some frames; images that COLMAP cannot read are missing."""
     image_dir = frames.image_dir
     if options.clahe:
         image_dir = database_path.parent / ENHANCED
@@ -71,7 +84,6 @@ def extract_features(
             extract,
             lambda database: progress("features", database.num_images(), total),
         )
-    _check_complete(frames, database_path)
     progress("features", total, total)
 
 
@@ -123,7 +135,7 @@ def _extraction_options(
     return extraction
 
 
-def _check_complete(frames: Frames, database_path: Path) -> None:
+def check_complete(frames: Frames, database_path: Path) -> None:
     """Every image must be in the database: COLMAP only logs those it cannot read."""
     with opened(database_path) as database:
         images = {image.name: image.image_id for image in database.read_all_images()}

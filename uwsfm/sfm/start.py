@@ -26,7 +26,13 @@ from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
 from uwsfm.sfm.options import FeatureOptions, StartOptions
-from uwsfm.sfm.parallel import workers_of
+from uwsfm.sfm.parallel import (
+    FEATURES,
+    MATCHES,
+    extract_elsewhere,
+    match_elsewhere,
+    workers_of,
+)
 from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
 from uwsfm.sfm.refractive_steps import map_refractively
 from uwsfm.sfm.steps import Steps
@@ -65,7 +71,7 @@ def perspective_start(
     frames = find_frames(Path(image_dir), rig)
     steps, space = Steps(Path(work_dir)), Workspace(work_dir=Path(work_dir))
     with workers_of(options, space.work_dir) as workers:
-        key = match_images(rig, frames, steps, space, options, progress)
+        key = match_images(rig, frames, steps, space, options, progress, workers)
         return start_from_matches(rig, frames, steps, key, options, progress, workers)
 
 
@@ -149,11 +155,14 @@ def match_images(
     space: Workspace,
     options: StartOptions,
     progress: Progress,
+    workers: Workers | None = None,
 ) -> str:
     """Features and raw matches, in the workspace's database; their fingerprint.
 
-    Neither depends on lenses, ports or poses.
+    Neither depends on lenses, ports or poses, nor on who finds them: threads of this
+    process, or workers elsewhere.
     """
+    elsewhere = workers if workers is not None and workers.elsewhere else None
     sizes = sorted([c.images, c.camera.width, c.camera.height] for c in rig.cameras)
     inputs = [
         [version("uwsfm"), pycolmap.__version__],
@@ -167,6 +176,11 @@ def match_images(
         check_images(frames, rig, num_threads=options.threads, progress=progress)
         if options.features.mask_dir is not None:
             check_masks(frames, rig, options.features.mask_dir)
+        if elsewhere is not None:
+            extract_elsewhere(
+                frames, rig, space.features, options.features, elsewhere, progress
+            )
+            return
         extract_features(
             frames,
             rig,
@@ -176,9 +190,30 @@ def match_images(
             progress=progress,
         )
 
+    def match() -> None:
+        # The paper's matcher is for few images, and stays here.
+        if elsewhere is not None and options.matching.matcher == "colmap":
+            match_elsewhere(
+                frames, space.features, options.matching, elsewhere, progress
+            )
+            return
+        match_features(
+            frames,
+            space.features,
+            options.matching,
+            seed=options.seed,
+            num_threads=options.threads,
+            progress=progress,
+        )
+
     def forget() -> None:
         remove_database(space.features)
-        shutil.rmtree(space.enhanced, ignore_errors=True)
+        for folder in (space.enhanced, space.work_dir / FEATURES):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def forget_matches() -> None:
+        clear_matches(space.features)
+        shutil.rmtree(space.work_dir / MATCHES, ignore_errors=True)
 
     key = steps.run("features", inputs, extract, outputs=[space.features], clear=forget)
     store_intrinsics(frames, rig, space.features)
@@ -187,16 +222,9 @@ def match_images(
     return steps.run(
         "matches",
         [key, asdict(options.matching), seeds],
-        lambda: match_features(
-            frames,
-            space.features,
-            options.matching,
-            seed=options.seed,
-            num_threads=options.threads,
-            progress=progress,
-        ),
+        match,
         outputs=[space.features],
-        clear=lambda: clear_matches(space.features),
+        clear=forget_matches,
     )
 
 

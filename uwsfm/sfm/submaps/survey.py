@@ -43,6 +43,7 @@ def map_parts(
         workers: Who maps.
         progress: Called with the step "submaps", in parts.
     """
+    folder = folder.absolute()  # workers have other places of their own
     parts = _parts(folder / PARTS, correspondences, max_frames)
     todo = [k for k in range(len(parts)) if not submap_path(folder, k).exists()]
     for k in todo:

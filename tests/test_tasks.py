@@ -1,0 +1,183 @@
+"""Tasks in processes of this machine and on a scheduler's workers; some are killed."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwsfm.demo import sample_dir
+from uwsfm.errors import InputError, UwsfmError
+from uwsfm.rig_file import load_rig
+from uwsfm.sfm.background import opened
+from uwsfm.sfm.images import find_frames
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.start import match_images
+from uwsfm.sfm.steps import Steps
+from uwsfm.sfm.workspace import Workspace
+from uwsfm.tasks import RETRIES, Workers
+
+
+def square(number: int) -> int:
+    return number**2
+
+
+def refuse(number: int, refused: int) -> int:
+    if number == refused:
+        raise InputError(f"number {number} is refused")
+    return number
+
+
+def die_once(number: int, fatal: int, folder: Path) -> tuple[int, int]:
+    """Kill the process at one number, the first time it comes."""
+    with (folder / f"{number}-{os.getpid()}").open("w"):
+        pass
+    if number == fatal and len(list(folder.glob(f"{number}-*"))) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number, os.getpid()
+
+
+def stumble(number: int, folder: Path) -> int:
+    """Fail as often as is forgiven."""
+    trial = len(list(folder.glob(f"{number}-*")))
+    (folder / f"{number}-{trial}").touch()
+    if trial < RETRIES:
+        raise OSError("disk full")
+    return number
+
+
+def test_one_process_does_all_in_order(tmp_path):
+    seen = []
+    with Workers(max_processes=1) as workers:
+        found = workers.run(
+            square, [(k,) for k in range(5)], "squares", lambda *s: seen.append(s)
+        )
+    assert found == [0, 1, 4, 9, 16]
+    assert seen == [("squares", k, 5) for k in range(6)]
+
+
+def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
+    for name in ("die", "stumble"):
+        (tmp_path / name).mkdir()
+    with Workers(max_processes=2) as workers:
+        if workers.num_processes < 2:
+            pytest.skip("one core")
+        tasks = [(k, 3, tmp_path / "die") for k in range(8)]
+        found = workers.run(die_once, tasks, "dying")
+        assert [number for number, _ in found] == list(range(8))
+        assert os.getpid() not in [process for _, process in found]
+        # The fatal task was done twice; no other was lost with it.
+        assert len(list((tmp_path / "die").glob("3-*"))) == 2
+        tasks = [(k, tmp_path / "stumble") for k in range(3)]
+        assert workers.run(stumble, tasks, "stumbling") == [0, 1, 2]
+        with pytest.raises(InputError, match="number 2 is refused"):
+            workers.run(refuse, [(k, 2) for k in range(4)], "refusing")
+
+
+@contextmanager
+def dask_cluster(folder: Path) -> Iterator[str]:
+    """A scheduler and two workers, as on other machines: another current folder, and
+    nothing of this process."""
+    place = folder / "scheduler.json"
+    common = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker"]
+    (folder / "elsewhere").mkdir()
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+    }
+    processes = [
+        subprocess.Popen(
+            [*dask, "--host=127.0.0.1", "--port=0", "--no-dashboard"]
+            + [f"--scheduler-file={place}"],
+            **common,
+        )
+    ]
+    try:
+        import distributed
+
+        processes += [
+            subprocess.Popen(
+                [
+                    *worker,
+                    f"--scheduler-file={place}",
+                    "--nthreads=1",
+                    "--no-dashboard",
+                ],
+                cwd=folder / "elsewhere",
+                env=environment,
+                **common,
+            )
+            for _ in range(2)
+        ]
+        with distributed.Client(scheduler_file=str(place), timeout=30) as client:
+            client.wait_for_workers(2, timeout=30)
+            address = client.scheduler.address
+        yield address
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+        for process in processes:
+            process.wait(timeout=20)
+
+
+def test_an_address_without_a_scheduler_is_told():
+    with pytest.raises(InputError, match="must be 'local' or an address"):
+        Workers("cluster")
+
+
+@pytest.mark.slow
+def test_workers_elsewhere_find_the_same_features_and_matches(tmp_path):
+    """Six images: the databases' rows are those of this process, bit by bit."""
+    images = tmp_path / "images"
+    for folder in ("left", "right"):
+        (images / folder).mkdir(parents=True)
+        for source in sorted((sample_dir() / "images" / folder).iterdir())[:3]:
+            (images / folder / source.name).symlink_to(source)
+    rig = load_rig(sample_dir() / "rig.yaml")
+    frames = find_frames(images, rig)
+    options = StartOptions(num_threads=1)
+    found = {}
+    with dask_cluster(tmp_path) as address:
+        for name, scheduler in (("here", "local"), ("there", address)):
+            space = Workspace(work_dir=tmp_path / name)
+            steps = Steps(space.work_dir)
+            with Workers(scheduler, space.work_dir) as workers:
+                match_images(
+                    rig, frames, steps, space, options, lambda *_: None, workers
+                )
+            found[name] = rows_of(space.features)
+            assert not list(space.work_dir.glob("features*"))
+        with (
+            Workers(address) as workers,
+            pytest.raises(InputError, match=r"worker tcp://.* does not see .*/missing"),
+        ):
+            workers.require_sight(tmp_path / "missing")
+    for name in ("keypoints", "descriptors", "matches"):
+        here, there = (found[place][name] for place in ("here", "there"))
+        assert here.keys() == there.keys()
+        for key, rows in here.items():
+            np.testing.assert_array_equal(rows, there[key])
+    with pytest.raises(UwsfmError, match="no Dask scheduler answers at tcp://"):
+        Workers(address)
+
+
+def rows_of(path: Path) -> dict[str, dict]:
+    """Everything in a database of features, by the names of the images."""
+    with opened(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        names = sorted(ids)
+        pairs = [(a, b) for a in names for b in names if a < b]
+        return {
+            "keypoints": {n: database.read_keypoints(ids[n]) for n in names},
+            "descriptors": {n: database.read_descriptors(ids[n]).data for n in names},
+            "matches": {
+                (a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs
+            },
+        }
