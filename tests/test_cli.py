@@ -24,6 +24,7 @@ COMMANDS = [
     ["init"],
     ["reconstruct"],
     ["demo"],
+    ["batch"],
     ["export"],
     ["simulate"],
     ["simulate", "images"],
@@ -50,7 +51,16 @@ def test_help(command):
 
 
 def test_help_and_version_import_nothing_heavy():
-    heavy = ("numpy", "scipy", "numba", "pycolmap", "cv2", "open3d", "yaml")
+    heavy = (
+        "numpy",
+        "scipy",
+        "numba",
+        "pycolmap",
+        "cv2",
+        "open3d",
+        "yaml",
+        "distributed",
+    )
     code = (
         "import sys; sys.argv = ['uwsfm', '--version']\n"
         "from uwsfm.cli import main\n"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from uwsfm.cli_batch import batch
 from uwsfm.cli_export import export, init_from
 from uwsfm.cli_options import (
     LengthsOption,
@@ -40,6 +41,7 @@ app = typer.Typer(
 )
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
+app.command()(batch)
 
 FAILED, WRONG_INPUT = 1, 2
 

@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from uwsfm.batch import Outcome
     from uwsfm.evaluate import Comparison
 
 console = Console()
@@ -262,6 +263,24 @@ def pinhole_table(report: dict[str, Any]) -> Table:
 
 
 _PINHOLE_COLUMNS = ("rms_px", "max_px", "constant_rms_px", "constant_max_px")
+
+
+def batch_table(outcomes: Iterable[Outcome]) -> Table:
+    """What became of each dive."""
+    table = Table(title="Dives", title_justify="left")
+    table.add_column("dive", no_wrap=True)
+    table.add_column("")
+    for column in ("frames", "RMS (px)", "minutes"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for outcome in outcomes:
+        frames, rms, result = "", "", Text(f"failed: {outcome.reason}", style="red")
+        if outcome.reason is None:
+            frames = f"{outcome.num_registered_frames} of {outcome.num_frames}"
+            rms, result = f"{outcome.rms_px:.3f}", Text("done")
+        minutes = outcome.seconds / 60.0
+        time = _number(None if math.isnan(minutes) else minutes, "{:.1f}")
+        table.add_row(Text(outcome.name), result, frames, rms, time)
+    return table
 
 
 def timings_table(timings: dict[str, float]) -> Table:

@@ -13,8 +13,8 @@ import os
 import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,7 +22,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 Result = TypeVar("Result")
 
@@ -103,27 +103,46 @@ class Workers:
             UwsfmError: what the first task that failed so raised; or a task lost its
                 worker again and again.
         """
-        progress(step, 0, len(arguments))
         if not self.elsewhere and min(len(arguments), self.num_processes) < 2:
+            progress(step, 0, len(arguments))
             results = []
             for done, each in enumerate(arguments, start=1):
                 results.append(function(*each))
                 progress(step, done, len(arguments))
             return results
-        return self._run_with_dask(function, arguments, step, progress)
+        found: dict[int, Result] = {}
+        with closing(self._finished(function, arguments, step, progress)) as finished:
+            for index, outcome in finished:
+                if isinstance(outcome, UwsfmError):
+                    raise outcome
+                found[index] = outcome
+        return [found[index] for index in range(len(arguments))]
 
-    def _run_with_dask(
+    def outcomes(
+        self,
+        function: Callable[..., Result],
+        arguments: Sequence[tuple[Any, ...]],
+        step: str,
+        progress: Progress = silent,
+    ) -> list[Result | UwsfmError]:
+        """`run`, where what stops a task does not stop the others: it is the task's
+        result. Tasks never run in this process, which one could take along."""
+        finished = self._finished(function, arguments, step, progress)
+        found = dict(finished)
+        return [found[index] for index in range(len(arguments))]
+
+    def _finished(
         self,
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         step: str,
         progress: Progress,
-    ) -> list[Result]:
+    ) -> Generator[tuple[int, Result | UwsfmError], None, None]:
+        """Tasks as they end: which one, and its result or why there is none."""
         import cloudpickle
         from distributed import as_completed
-        from distributed.client import FutureCancelledError
-        from distributed.scheduler import KilledWorker
 
+        progress(step, 0, len(arguments))
         client = self._client or self._start_processes()
         paths = [] if self.elsewhere else sys.path
         futures = client.map(
@@ -134,24 +153,12 @@ class Workers:
             pure=False,
         )
         place = {future.key: index for index, future in enumerate(futures)}
-        results: dict[int, Any] = {}
         try:
-            for future in as_completed(futures):
-                result = future.result()
-                if isinstance(result, UwsfmError):
-                    raise result
-                results[place[future.key]] = result
-                progress(step, len(results), len(arguments))
-        except KilledWorker:
-            raise UwsfmError(
-                f"{step}: a task lost its worker {RETRIES + 2} times, for want of "
-                "memory perhaps: give it more, or fewer workers"
-            ) from None
-        except FutureCancelledError:
-            raise UwsfmError(f"{step}: the scheduler went away") from None
+            for done, future in enumerate(as_completed(futures), start=1):
+                yield place[future.key], _result_of(future, step)
+                progress(step, done, len(arguments))
         finally:
             client.cancel(futures)
-        return [results[index] for index in range(len(arguments))]
 
     def _start_processes(self) -> Client:
         """A cluster of processes of one thread each, which end with this object.
@@ -241,6 +248,22 @@ def local_workers() -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     free = int(psutil.virtual_memory().available / BYTES_PER_WORKER)
     return max(1, min(cores or os.cpu_count() or 1, free))
+
+
+def _result_of(future: Future, step: str) -> Any:
+    """Of a task; an error that says so if its worker or the scheduler was lost."""
+    from distributed.client import FutureCancelledError
+    from distributed.scheduler import KilledWorker
+
+    try:
+        return future.result()
+    except KilledWorker:
+        return UwsfmError(
+            f"{step}: a task lost its worker again and again, for want of memory "
+            "perhaps: give it more, or fewer workers"
+        )
+    except FutureCancelledError:
+        return UwsfmError(f"{step}: the scheduler went away")
 
 
 def _call(packed: tuple[list[str], bytes]) -> Any:

@@ -1,0 +1,155 @@
+"""Many dives: their file, and what becomes of them."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pycolmap
+import pytest
+import yaml
+
+from uwsfm.batch import LOG
+from uwsfm.demo import sample_dir
+from uwsfm.dives_file import load_dives
+from uwsfm.errors import InputError
+from uwsfm.rig_file import dump_rig, load_rig
+
+DIVE = {"name": "bow", "rig": "rig.yaml", "images": "wreck/bow"}
+
+
+def written(folder: Path, content: dict) -> Path:
+    path = folder / "dives.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_dives_inherit_options_and_find_their_files(tmp_path):
+    stern = {
+        **DIVE,
+        "name": "stern",
+        "out": "results/stern",
+        "options": {
+            "clahe": False,
+            "lengths": "wreck/lengths.yaml",
+            "lever_arm": [0.2, -0.1, 1],
+            "refine": ["water-index"],
+            "prior": {"water_index_stddev": 0.002},
+        },
+    }
+    content = {"version": 1, "options": {"clahe": True}, "dives": [DIVE, stern]}
+    bow, other = load_dives(written(tmp_path, content))
+    assert (bow.rig, bow.images) == (tmp_path / "rig.yaml", tmp_path / "wreck/bow")
+    assert (bow.out, other.out) == (tmp_path / "bow", tmp_path / "results/stern")
+    assert bow.options == {"clahe": True}
+    assert other.options == {
+        "clahe": False,
+        "lengths": tmp_path / "wreck/lengths.yaml",
+        "lever_arm": (0.2, -0.1, 1.0),
+        "refine_water_index": True,
+        "water_index_stddev": 0.002,
+    }
+
+
+@pytest.mark.parametrize(
+    "dives, message",
+    [
+        (
+            [{**DIVE, "image": "x"}],
+            r"dives\[0\].image: unknown key, did you mean images",
+        ),
+        (
+            [{**DIVE, "options": {"matches": "all"}}],
+            r"dives\[0\].options.matches: unknown key, did you mean matcher\?",
+        ),
+        (
+            [{**DIVE, "options": {"prior": {"focal": 0.1}}}],
+            r"dives\[0\].options.prior.focal: unknown key; .* focal_stddev, ",
+        ),
+        ([{**DIVE, "options": {"seed": -1}}], r"options.seed: must be at least 0"),
+        ([DIVE, DIVE], r"dives\[1\].name: is that of dives\[0\]"),
+        (
+            [DIVE, {**DIVE, "name": "stern", "out": "./bow"}],
+            r"dives\[1\].out: is that of dives\[0\]",
+        ),
+        ([{**DIVE, "name": "a/b"}], r"dives\[0\].name: must be the name of a folder"),
+        ([], r"dives: there is none in the list"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_with_its_key(tmp_path, dives, message):
+    path = written(tmp_path, {"version": 1, "dives": dives})
+    with pytest.raises(InputError, match=f"{path}: .*{message}"):
+        load_dives(path)
+
+
+def small_dive(folder: Path, num_frames: int, scale: float = 0.4) -> None:
+    """The first frames of the sample, reduced, and their rig."""
+    rig = load_rig(sample_dir() / "rig.yaml")
+    cameras = []
+    for item in rig.cameras:
+        (folder / "images" / item.images).mkdir(parents=True)
+        sources = sorted((sample_dir() / "images" / item.images).iterdir())
+        for source in sources[:num_frames]:
+            image = cv2.imread(str(source))
+            small = cv2.resize(
+                image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+            )
+            target = folder / "images" / item.images / source.with_suffix(".png").name
+            cv2.imwrite(str(target), small)
+        lens = item.camera
+        camera = pycolmap.Camera(
+            model=lens.model_name,
+            width=lens.width,
+            height=lens.height,
+            params=lens.params,
+            has_prior_focal_length=True,
+        )
+        camera.rescale(scale)
+        cameras.append(replace(item, camera=camera))
+    dump_rig(replace(rig, cameras=tuple(cameras)), folder / "rig.yaml", "")
+
+
+@pytest.mark.slow
+def test_a_failed_dive_does_not_stop_the_others(tmp_path):
+    """The second of three dives has no images, the third cannot be matched."""
+    small_dive(tmp_path, num_frames=6)
+    blank = tmp_path / "blank"
+    for folder in ("left", "right"):
+        (blank / folder).mkdir(parents=True)
+        for source in (tmp_path / "images" / folder).iterdir():
+            image = cv2.imread(str(source))
+            cv2.imwrite(str(blank / folder / source.name), 0 * image + 90)
+    dives = [
+        {"name": "good", "rig": "rig.yaml", "images": "images"},
+        {"name": "lost", "rig": "rig.yaml", "images": "nowhere"},
+        {"name": "blank", "rig": "rig.yaml", "images": "blank"},
+        {"name": "again", "rig": "rig.yaml", "images": "images"},
+    ]
+    path = written(tmp_path, {"version": 1, "dives": dives})
+    found = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from uwsfm.cli import main; main()",
+            "batch",
+            str(path),
+        ],
+        capture_output=True,
+        text=True,
+        env=None,
+        check=False,
+    )
+    assert found.returncode == 1
+    assert "2 of 4 dives failed" in found.stderr
+    table = " ".join(found.stdout.split())
+    for dive in dives:
+        assert dive["name"] in table
+    assert table.count("6 of 6") == 2
+    assert "does not exist" in " ".join(table.replace("│", " ").split())
+    for name in ("good", "again"):
+        assert (tmp_path / name / "summary.json").exists()
+        log = (tmp_path / name / LOG).read_text()
+        assert "mapping" in log and log.rstrip().endswith("done")
+    assert "no features were found" in (tmp_path / "blank" / LOG).read_text()
+    assert "Traceback" not in found.stdout + found.stderr

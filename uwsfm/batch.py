@@ -1,0 +1,151 @@
+"""Many dives, each by itself: what stops one never stops another."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from uwsfm._progress import Progress, silent
+from uwsfm.dives_file import Dive, load_dives
+from uwsfm.errors import UwsfmError
+from uwsfm.pipeline import output_folder, reconstruct
+from uwsfm.tasks import LOCAL, Workers
+
+LOG = "uwsfm.log"
+"""In the output folder of each dive."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a dive."""
+
+    name: str
+    reason: str | None
+    """Why it failed, one sentence; None: it did not."""
+    seconds: float
+    num_frames: int = 0
+    num_registered_frames: int = 0
+    rms_px: float = float("nan")
+    """True reprojection error."""
+
+
+def run_batch(
+    dives: str | Path | Sequence[Dive],
+    *,
+    scheduler: str = LOCAL,
+    num_threads: int = -1,
+    progress: Progress = silent,
+) -> list[Outcome]:
+    """Reconstruct many dives, each in a process of its own, some at a time.
+
+    Args:
+        dives: A dives.yaml, see `uwsfm.dives_file`, or what it holds.
+        scheduler: "local", or the address of a Dask scheduler.
+        num_threads: Of all dives together; -1 for all cores.
+        progress: Called with the step "dives".
+
+    Returns:
+        What became of each, in their order. A dive that was stopped or has failed goes
+        on where it was when it is run again.
+
+    Raises:
+        InputError: the file or the scheduler is not usable.
+    """
+    if isinstance(dives, (str, Path)):
+        dives = load_dives(dives)
+    limit = None if num_threads < 0 else num_threads
+    with Workers(scheduler, max_processes=limit) as workers:
+        for folder in {dive.out.parent for dive in dives}:
+            if workers.elsewhere:
+                folder.mkdir(parents=True, exist_ok=True)
+                workers.require_sight(folder)
+        threads = 1
+        if not workers.elsewhere:
+            threads = max(1, workers.num_processes // len(dives))
+        found = workers.outcomes(
+            run_dive, [(dive, threads) for dive in dives], "dives", progress
+        )
+    return [
+        outcome
+        if isinstance(outcome, Outcome)
+        else Outcome(name=dive.name, reason=str(outcome), seconds=float("nan"))
+        for dive, outcome in zip(dives, found, strict=True)
+    ]
+
+
+def run_dive(dive: Dive, num_threads: int) -> Outcome:
+    """Reconstruct a dive; whatever goes wrong is its outcome, and in its log."""
+    began = time.monotonic()
+    try:
+        out = output_folder(dive.out)
+        out.mkdir(parents=True, exist_ok=True)
+        with _logged(out / LOG) as log:
+            log.info("dive %s, images %s", dive.name, dive.images)
+            try:
+                result = reconstruct(
+                    dive.rig,
+                    dive.images,
+                    out,
+                    num_threads=num_threads,
+                    progress=_StepLog(log),
+                    **dive.options,
+                )
+            except Exception:
+                log.error("%s", traceback.format_exc())
+                raise
+            for warning in result.summary["warnings"]:
+                log.info("note: %s", warning)
+            log.info("done")
+    except UwsfmError as error:
+        reason = str(error)
+    except MemoryError:
+        reason = "out of memory"
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}; see {dive.out / LOG}"
+    else:
+        summary = result.summary
+        return Outcome(
+            name=dive.name,
+            reason=None,
+            seconds=time.monotonic() - began,
+            num_frames=summary["num_frames"],
+            num_registered_frames=summary["num_registered_frames"],
+            rms_px=summary["reprojection_rms_px"]["after"],
+        )
+    return Outcome(name=dive.name, reason=reason, seconds=time.monotonic() - began)
+
+
+class _StepLog:
+    """Notes when a step begins and ends."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._step: str | None = None
+
+    def __call__(self, step: str, done: int, total: int | None) -> None:
+        if step != self._step:
+            self._log.info("%s", step)
+            self._step = step
+
+
+@contextmanager
+def _logged(path: Path) -> Iterator[logging.Logger]:
+    """What uwsfm logs in this process goes to the end of a file."""
+    log = logging.getLogger("uwsfm")
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield log.getChild(f"batch.{os.getpid()}")
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+        handler.close()

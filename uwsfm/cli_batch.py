@@ -1,0 +1,35 @@
+"""`uwsfm batch`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from uwsfm.cli_options import SchedulerOption
+
+
+def batch(
+    dives: Annotated[
+        Path, typer.Argument(help="A YAML file of dives, see the README.")
+    ],
+    scheduler: SchedulerOption = "local",
+    threads: Annotated[
+        int, typer.Option(min=-1, help="Of all dives together; -1: all cores.")
+    ] = -1,
+) -> None:
+    """Reconstruct many dives; one that fails never stops the others.
+
+    Run the same command again to go on with those that failed or were stopped.
+    """
+    from uwsfm.batch import run_batch
+    from uwsfm.console import ProgressBars, batch_table, console
+
+    with ProgressBars() as progress:
+        outcomes = run_batch(
+            dives, scheduler=scheduler, num_threads=threads, progress=progress
+        )
+    console.print(batch_table(outcomes))
+    failed = [outcome for outcome in outcomes if outcome.reason is not None]
+    if failed:
+        typer.echo(f"{len(failed)} of {len(outcomes)} dives failed", err=True)
+        raise typer.Exit(1)
