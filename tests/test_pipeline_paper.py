@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from uwsfm.tasks import Workers
+
 pytest.importorskip("matplotlib")
 
+HERE = Workers(max_processes=1)
 FOLDER = Path(__file__).parent.parent / "pipelines" / "paper"
 
 
@@ -71,7 +74,7 @@ def test_caustics_lie_behind_the_camera(tmp_path):
 def test_single_pair_tables(tmp_path):
     import single_pair
 
-    rows = single_pair.noise_table(2, 1, noises_px=(0.0, 0.5), num_points=60)
+    rows = single_pair.noise_table(2, HERE, noises_px=(0.0, 0.5), num_points=60)
     assert len(rows) == 2 * 3 * 2
     assert {row["error_function"] for row in rows} == set(single_pair.ERRORS)
     optional = ("rmse_over_bound_both", "ratio_error")
@@ -79,7 +82,7 @@ def test_single_pair_tables(tmp_path):
     check_round_trip(rows, tmp_path / "noise.csv")
     for row in rows[:6]:
         assert row["max_deg"] < 1e-4  # what the solver's tolerance leaves
-    rows = single_pair.distance_table(2, 1, distances_mm=(10.0, 20.0), num_points=60)
+    rows = single_pair.distance_table(2, HERE, distances_mm=(10.0, 20.0), num_points=60)
     assert len(rows) == 2 * 3 * 2
     assert np.all(np.isfinite(numbers(rows)))
     wrong, right = rows[0], rows[1]
@@ -91,7 +94,7 @@ def test_many_pairs_table(tmp_path):
 
     tiny = {"noises_px": (0.0, 0.25), "num_frames": 5, "num_points": 60}
     case = many_pairs.Case(name="tiny", methods=many_pairs.STRATEGIES, **tiny)
-    rows = many_pairs.table(2, 1, cases=(case,))
+    rows = many_pairs.table(2, HERE, cases=(case,))
     assert [row["method"] for row in rows] == ["joint", "nested"] * 2
     optional = tuple(name for name in rows[0] if "_z_" in name or "ratio" in name)
     assert np.all(np.isfinite(numbers(rows, optional)))
@@ -119,7 +122,7 @@ def test_basin_table():
     import basin
 
     case = replace(basin.CASE, num_frames=5, num_points=60)
-    rows = basin.table(1, 1, case=case)
+    rows = basin.table(1, HERE, case=case)
     assert len(rows) == len(basin.ANGLES_DEG) * len(basin.DISTANCE_SCALES)
     assert np.all(np.isfinite(numbers(rows)))
     assert rows[0]["converged_percent"] == 100.0  # 5 degrees off, distance x 0.1

@@ -144,10 +144,9 @@ class Workers:
 
         progress(step, 0, len(arguments))
         client = self._client or self._start_processes()
-        paths = [] if self.elsewhere else sys.path
         futures = client.map(
             _call,
-            [(paths, cloudpickle.dumps((function, each))) for each in arguments],
+            [(sys.path, cloudpickle.dumps((function, each))) for each in arguments],
             key=[f"{step}-{os.urandom(8).hex()}" for _ in arguments],
             retries=RETRIES,
             pure=False,
@@ -267,7 +266,11 @@ def _result_of(future: Future, step: str) -> Any:
 
 
 def _call(packed: tuple[list[str], bytes]) -> Any:
-    """What a worker does. Wrong input comes back as a result: no use to try again."""
+    """What a worker does. Wrong input comes back as a result: no use to try again.
+
+    Modules that it has not are looked for where this process has them: those of a
+    script, on a disk that is shared.
+    """
     paths, task = packed
     sys.path.extend(path for path in paths if path not in sys.path)
     import numpy  # noqa: F401  before pycolmap, which unpickling may import

@@ -13,6 +13,7 @@ import uwsfm
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.geometry.unit_vector import plus
 from uwsfm.scene import Scene
+from uwsfm.tasks import Workers
 
 ANGLES_DEG = (5.0, 10.0, 20.0)
 DISTANCE_SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
@@ -69,10 +70,10 @@ def _moved(scene: Scene, angle_deg: float, scale: float, rng) -> Scene:
     return replace(scene, cameras=tuple(cameras))
 
 
-def table(runs: int, processes: int, case: Case = CASE) -> list[Row]:
+def table(runs: int, workers: Workers, case: Case = CASE) -> list[Row]:
     """A row per angle and factor."""
     tasks = [Task(case=case, seed=seed) for seed in range(runs)]
-    found = sum(run_all(solve, tasks, processes, "basin"), [])
+    found = sum(run_all(solve, tasks, workers, "basin"), [])
     rows = []
     for angle, scale in product(ANGLES_DEG, DISTANCE_SCALES):
         mine = select(found, normal_off_deg=angle, distance_scale=scale)

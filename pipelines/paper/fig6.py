@@ -17,10 +17,10 @@ TABLES = ("fig6_noise", "fig6_distance", "fig6_images")
 
 
 def compute(settings: Settings) -> Iterator[tuple[str, list[Row]]]:
-    runs, processes = settings.runs, settings.processes
-    yield "fig6_noise", single_pair.noise_table(runs, processes)
-    yield "fig6_distance", single_pair.distance_table(runs, processes)
-    yield "fig6_images", rendered_pairs.table(settings.work, processes)
+    runs, workers = settings.runs, settings.workers
+    yield "fig6_noise", single_pair.noise_table(runs, workers)
+    yield "fig6_distance", single_pair.distance_table(runs, workers)
+    yield "fig6_images", rendered_pairs.table(settings.work, workers)
 
 
 def plot(found: Tables, out: Path) -> None:

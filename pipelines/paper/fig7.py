@@ -19,8 +19,8 @@ SERIES = {
 
 
 def compute(settings: Settings) -> Iterator[tuple[str, list[Row]]]:
-    yield "fig7", many_pairs.table(settings.runs, settings.processes)
-    yield "fig7_basin", basin.table(settings.runs, settings.processes)
+    yield "fig7", many_pairs.table(settings.runs, settings.workers)
+    yield "fig7_basin", basin.table(settings.runs, settings.workers)
 
 
 def plot(found: Tables, out: Path) -> None:

@@ -38,6 +38,7 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion
+from uwsfm.tasks import Workers
 
 NOISES_PX = (0.0, 0.1, 0.25, 0.5, 1.0)
 NUM_FRAMES = 15
@@ -177,14 +178,14 @@ def _rotation_error_deg(found: Scene, truth: Scene) -> float:
     return float(np.degrees(rms(rigid3.rotation_angle(difference))))
 
 
-def table(runs: int, processes: int, cases: Sequence[Case] = CASES) -> list[Row]:
+def table(runs: int, workers: Workers, cases: Sequence[Case] = CASES) -> list[Row]:
     """Figure 7: a row per case, noise level and method."""
     tasks = [
         Task(case=case, noise_px=noise, seed=seed)
         for case in cases
         for seed, (noise, _) in enumerate(product(case.noises_px, range(runs)))
     ]
-    found = sum(run_all(solve, tasks, processes, "fig. 7"), [])
+    found = sum(run_all(solve, tasks, workers, "fig. 7"), [])
     return [
         _summary(select(found, case=case.name, noise_px=noise, method=method), case)
         for case in cases

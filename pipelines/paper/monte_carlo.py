@@ -1,18 +1,16 @@
-"""Many independent runs on all cores, and what they say together."""
+"""Many independent runs on all cores, or a cluster, and what they say together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.progress import track
-from threadpoolctl import threadpool_limits
 
 import uwsfm
 from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.console import ProgressBars
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
@@ -22,6 +20,7 @@ from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion
+from uwsfm.tasks import Workers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -30,33 +29,21 @@ Result = TypeVar("Result")
 def run_all(
     function: Callable[[Task], Result],
     tasks: Sequence[Task],
-    processes: int,
+    workers: Workers,
     label: str,
 ) -> list[Result]:
-    """``[function(task) for task in tasks]`` in several processes.
+    """``[function(task) for task in tasks]``, by workers.
 
     Args:
         function: Of a module, so that another process can import it.
         tasks: Each with its own seed; picklable.
-        processes: 1 runs in this process.
+        workers: Who run them.
         label: Of the progress bar.
     """
-    if processes == 1:
-        return [function(task) for task in track(tasks, label, transient=True)]
     # Kernels are compiled here once; the workers load them.
     warm_up()
-    # Spawned: a fork would copy the threads of OpenBLAS and COLMAP half alive.
-    context = get_context("spawn")
-    with context.Pool(processes, initializer=_one_thread) as pool:
-        running = pool.imap(function, tasks)
-        results = list(track(running, label, total=len(tasks), transient=True))
-        pool.close()
-        pool.join()  # or the workers would be killed, which COLMAP reports at length
-    return results
-
-
-def _one_thread() -> None:
-    threadpool_limits(1)  # two processes with two BLAS threads each are slower
+    with ProgressBars() as progress:
+        return workers.run(function, [(task,) for task in tasks], label, progress)
 
 
 @cache

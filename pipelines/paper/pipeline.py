@@ -22,6 +22,7 @@ from settings import Settings
 from tables import Tables, read_csv, write_csv
 
 from uwsfm._files import replaced_file
+from uwsfm.tasks import LOCAL, Workers
 
 FIGURES = {"fig3": fig3, "fig6": fig6, "fig7": fig7, "loops": loops, "fig8": fig8}
 TIMES = "times.csv"
@@ -31,17 +32,15 @@ def main() -> None:
     options = parse()
     out: Path = options.out
     out.mkdir(parents=True, exist_ok=True)
-    settings = Settings(
-        runs=options.runs,
-        processes=options.processes,
-        work=out / "work",
-        tank=options.tank,
-    )
-    for name in options.only:
-        began = time.monotonic()
-        for table, rows in FIGURES[name].compute(settings):
-            write_csv(rows, out / f"{table}.csv")
-        note_time(out, name, time.monotonic() - began, settings)
+    with Workers(options.scheduler, out, options.processes) as workers:
+        settings = Settings(
+            runs=options.runs, workers=workers, work=out / "work", tank=options.tank
+        )
+        for name in options.only:
+            began = time.monotonic()
+            for table, rows in FIGURES[name].compute(settings):
+                write_csv(rows, out / f"{table}.csv")
+            note_time(out, name, time.monotonic() - began, settings)
     found = read_tables(out)
     sections = [HEADER, times(out), targets.section(found)]
     for figure in FIGURES.values():
@@ -61,7 +60,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--tank", type=Path, metavar="DATA", help="the real rig")
     parser.add_argument("--runs", type=int, default=100, help="per level")
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=2, help="of this machine")
+    parser.add_argument("--scheduler", default=LOCAL, help="of Dask: tcp://HOST:PORT")
     parser.add_argument("--only", default=",".join(FIGURES), help="of: %(default)s")
     options = parser.parse_args()
     options.only = options.only.split(",") if options.only else []
@@ -94,7 +94,7 @@ def note_time(out: Path, name: str, seconds: float, settings: Settings) -> None:
             "figure": name,
             "minutes": seconds / 60.0,
             "runs": settings.runs,
-            "processes": settings.processes,
+            "processes": settings.workers.num_processes,
         }
     )
     write_csv(sorted(rows, key=lambda row: row["figure"]), path)

@@ -23,6 +23,7 @@ from uwsfm.sfm.same_frame_scene import same_frame_scene
 from uwsfm.simulate.rigs import nominal_rig, paper_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence
 from uwsfm.simulate.trajectories import rich_motion
+from uwsfm.tasks import Workers
 
 NUM_PAIRS = 8
 
@@ -35,13 +36,13 @@ def spec() -> SequenceSpec:
 
 
 def table(
-    work: Path, processes: int, distances_mm: Sequence[float] = DISTANCES_MM
+    work: Path, workers: Workers, distances_mm: Sequence[float] = DISTANCES_MM
 ) -> list[Row]:
     """Per assumed distance and error function: single pairs, and all of them.
 
     Args:
         work: Keeps the images and their features for the next time.
-        processes: That share the solves.
+        workers: Who share the solves.
         distances_mm: Of both ports, assumed.
     """
     images = work / "rendered_pairs"
@@ -54,7 +55,7 @@ def table(
         for name, scene in scenes.items()
         for error, distance in product(ERRORS, distances_mm)
     ]
-    return _summaries(sum(run_all(solve, tasks, processes, "fig. 6, images"), []))
+    return _summaries(sum(run_all(solve, tasks, workers, "fig. 6, images"), []))
 
 
 @dataclass(frozen=True, kw_only=True)

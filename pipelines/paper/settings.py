@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from uwsfm.tasks import Workers
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     runs: int
     """Monte-Carlo runs per level."""
-    processes: int
+    workers: Workers
+    """Who share them."""
     work: Path
     """Images, features and reconstructions, kept for the next time."""
     tank: Path | None

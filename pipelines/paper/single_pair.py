@@ -30,6 +30,7 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import level_poses
+from uwsfm.tasks import Workers
 
 ERRORS = ("reprojection", "virtual_camera", "virtual_camera_tangential")
 """The error in space says nothing of one pair: for any ports, a point that is where its
@@ -96,7 +97,7 @@ def solve(task: Task) -> list[Row]:
 
 def noise_table(
     runs: int,
-    processes: int,
+    workers: Workers,
     noises_px: Sequence[float] = NOISES_PX,
     num_points: int = NUM_POINTS,
 ) -> list[Row]:
@@ -105,7 +106,7 @@ def noise_table(
         Task(noise_px=noise, seed=seed, num_points=num_points)
         for seed, (noise, _) in enumerate(product(noises_px, range(runs)))
     ]
-    found = sum(run_all(solve, tasks, processes, "fig. 6 left"), [])
+    found = sum(run_all(solve, tasks, workers, "fig. 6 left"), [])
     rows = []
     for noise, error in product(noises_px, ERRORS):
         both = select(found, noise_px=noise, error_function=error)
@@ -145,7 +146,7 @@ def _pooled_ratio(rows: list[Row]) -> tuple[float | None, float | None]:
 
 def distance_table(
     runs: int,
-    processes: int,
+    workers: Workers,
     distances_mm: Sequence[float] = DISTANCES_MM,
     num_points: int = NUM_POINTS,
 ) -> list[Row]:
@@ -156,7 +157,7 @@ def distance_table(
         )
         for seed, (noise, _) in enumerate(product((0.0, NOISE_PX), range(runs)))
     ]
-    found = sum(run_all(solve, tasks, processes, "fig. 6 right"), [])
+    found = sum(run_all(solve, tasks, workers, "fig. 6 right"), [])
     rows = []
     for noise, error, distance in product((0.0, NOISE_PX), ERRORS, distances_mm):
         mine = select(found, noise_px=noise, error_function=error, assumed_mm=distance)

@@ -10,11 +10,11 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 sys.path.append(str(Path(__file__).parent.parent / "paper"))
@@ -31,6 +31,8 @@ from pose_trials import PORTS, absolute_trial, relative_trial  # noqa: E402
 from tables import Row, markdown, read_csv, write_csv  # noqa: E402
 
 from uwsfm._files import replaced_file  # noqa: E402
+from uwsfm.console import ProgressBars  # noqa: E402
+from uwsfm.tasks import LOCAL, Workers  # noqa: E402
 
 ABSOLUTE_CSV, RELATIVE_CSV = "absolute_pose.csv", "relative_pose.csv"
 NOISES_PX = (0.0, 0.5, 1.2, 2.0)
@@ -51,13 +53,19 @@ PEER_ABSOLUTE_MS, PEER_RELATIVE_MS = "6.8-12", "145"
 def main() -> None:
     options = parse()
     options.out.mkdir(parents=True, exist_ok=True)
-    with threadpool_limits(1):
-        if options.absolute:
-            rows = study_absolute(options.absolute)
-            write_csv(rows, options.out / ABSOLUTE_CSV)
-        if options.relative:
-            rows = study_relative(options.relative)
-            write_csv(rows, options.out / RELATIVE_CSV)
+    cases = list(product(PORTS, NOISES_PX))
+    with (
+        Workers(options.scheduler, options.out, options.processes) as workers,
+        ProgressBars() as progress,
+    ):
+        for name, function, runs, path in (
+            ("absolute poses", absolute_rows, options.absolute, ABSOLUTE_CSV),
+            ("relative poses", relative_rows, options.relative, RELATIVE_CSV),
+        ):
+            if runs:
+                tasks = [(*case, runs) for case in cases]
+                rows = sum(workers.run(function, tasks, name, progress), [])
+                write_csv(rows, options.out / path)
     with replaced_file(options.out / "poses.md") as partial:
         partial.write_text(page(options.out), encoding="utf-8")
     print(options.out / "poses.md")
@@ -70,74 +78,57 @@ def parse() -> argparse.Namespace:
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--absolute", type=int, default=1000, metavar="RUNS")
     parser.add_argument("--relative", type=int, default=300, metavar="RUNS")
+    parser.add_argument("--processes", type=int, default=1, help="of this machine")
+    parser.add_argument("--scheduler", default=LOCAL, help="of Dask: tcp://HOST:PORT")
     options = parser.parse_args()
     if min(options.absolute, options.relative) < 0:
         parser.error("RUNS must not be negative")
     return options
 
 
-def study_absolute(runs: int) -> list[Row]:
-    rows: list[Row] = []
-    for port in PORTS:
-        for noise in NOISES_PX:
-            label = f"absolute, {port}, {noise} px"
-            errors = run_all(
-                [absolute_trial(port, noise, seed) for seed in range(runs)],
-                ABSOLUTE,
-                absolute_errors,
-                label,
-            )
-            rng = np.random.default_rng(0)
-            draws = [
-                draw
-                for seed in range(runs)
-                for draw in absolute_bound(
-                    absolute_trial(port, noise, seed), noise, rng
-                )
-            ]
-            peer = PEER_ABSOLUTE.get((port, noise))
-            rows += rows_of(
-                port, noise, errors, ("position_mm", PEER_ABSOLUTE_MS), peer
-            )
-            rows.append(row_of(port, noise, "bound", draws, "position_mm"))
-    return rows
+def absolute_rows(port: str, noise: float, runs: int) -> list[Row]:
+    """One port and level of noise: a row per method."""
+    trials = [absolute_trial(port, noise, seed) for seed in range(runs)]
+    errors = errors_of(trials, ABSOLUTE, absolute_errors)
+    rng = np.random.default_rng(0)
+    draws = [d for trial in trials for d in absolute_bound(trial, noise, rng)]
+    peer = PEER_ABSOLUTE.get((port, noise))
+    measured = ("position_mm", PEER_ABSOLUTE_MS)
+    rows = rows_of(port, noise, errors, measured, peer)
+    return [*rows, row_of(port, noise, "bound", draws, "position_mm")]
 
 
-def study_relative(runs: int) -> list[Row]:
-    rows: list[Row] = []
-    for port in PORTS:
-        for noise in NOISES_PX:
-            label = f"relative, {port}, {noise} px"
-            trials = [relative_trial(port, noise, seed) for seed in range(runs)]
-            errors = run_all(trials, RELATIVE, relative_errors, label)
-            peer = PEER_RELATIVE.get((port, noise))
-            measured = ("direction_deg", PEER_RELATIVE_MS)
-            rows += rows_of(port, noise, errors, measured, peer)
-            rng = np.random.default_rng(0)
-            draws = [d for trial in trials for d in relative_bound(trial, noise, rng)]
-            rows.append(row_of(port, noise, "bound", draws, "direction_deg"))
-    return rows
+def relative_rows(port: str, noise: float, runs: int) -> list[Row]:
+    """One port and level of noise: a row per method."""
+    trials = [relative_trial(port, noise, seed) for seed in range(runs)]
+    errors = errors_of(trials, RELATIVE, relative_errors)
+    rng = np.random.default_rng(0)
+    draws = [d for trial in trials for d in relative_bound(trial, noise, rng)]
+    peer = PEER_RELATIVE.get((port, noise))
+    measured = ("direction_deg", PEER_RELATIVE_MS)
+    rows = rows_of(port, noise, errors, measured, peer)
+    return [*rows, row_of(port, noise, "bound", draws, "direction_deg")]
 
 
 Errors = dict[str, list[tuple[float, float, float]]]
 """By method: rotation, position or direction, milliseconds of each trial."""
 
 
-def run_all(
+def errors_of(
     trials: Sequence[Any],
     methods: dict[str, Callable[[Any], Any]],
-    errors_of: Callable[[Any, Any], tuple[float, float]],
-    label: str,
+    compare: Callable[[Any, Any], tuple[float, float]],
 ) -> Errors:
     found: Errors = {name: [] for name in methods}
-    for name, method in methods.items():
-        method(trials[0])  # loads kernels: not timed
-        for trial in track(trials, f"{label}: {name}", transient=True):
-            began = time.process_time()
-            pose = method(trial)
-            spent = 1e3 * (time.process_time() - began)
-            pair = (np.inf, np.inf) if pose is None else errors_of(pose, trial)
-            found[name].append((*pair, spent))
+    with threadpool_limits(1):
+        for name, method in methods.items():
+            method(trials[0])  # loads kernels: not timed
+            for trial in trials:
+                began = time.process_time()
+                pose = method(trial)
+                spent = 1e3 * (time.process_time() - began)
+                pair = (np.inf, np.inf) if pose is None else compare(pose, trial)
+                found[name].append((*pair, spent))
     return found
 
 

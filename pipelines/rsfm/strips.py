@@ -11,7 +11,6 @@ the truth, never scaled. OUT receives strips.csv, strips.md and strips.png.
 
 import argparse
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import uwsfm
+from uwsfm.console import ProgressBars
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows, triangulate_tracks
@@ -35,6 +35,7 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import known_cam_from_rig, nominal_rig, paper_rig
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
+from uwsfm.tasks import LOCAL, Workers
 
 sys.path.append(str(Path(__file__).parent.parent / "paper"))
 
@@ -300,7 +301,8 @@ def main() -> None:
     )
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--runs", type=int, default=5, help="dives per case")
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=2, help="of this machine")
+    parser.add_argument("--scheduler", default=LOCAL, help="of Dask: tcp://HOST:PORT")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     strips = [
@@ -308,8 +310,12 @@ def main() -> None:
         for altitude, distance in product(ALTITUDES, DISTANCES)
         for seed in range(options.runs)
     ]
-    with ProcessPoolExecutor(options.processes) as pool:
-        rows = [row for strip in pool.map(outcomes, strips) for row in strip]
+    with (
+        Workers(options.scheduler, options.out, options.processes) as workers,
+        ProgressBars() as progress,
+    ):
+        tasks = [(strip,) for strip in strips]
+        rows = sum(workers.run(outcomes, tasks, "strips", progress), [])
     write_csv(rows, options.out / "strips.csv")
     lines = summarized(rows)
     text = markdown(lines, TABLE)
