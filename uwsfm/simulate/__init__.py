@@ -7,12 +7,15 @@ from uwsfm.simulate.observations import (
 )
 from uwsfm.simulate.perturbations import Perturbation, perturbed
 from uwsfm.simulate.relief import Relief
+from uwsfm.simulate.surveys import SurveySpec, simulate_survey
 
 __all__ = [
     "ObservationOptions",
     "Perturbation",
     "Relief",
     "SimulatedScene",
+    "SurveySpec",
     "perturbed",
     "simulate_scene",
+    "simulate_survey",
 ]

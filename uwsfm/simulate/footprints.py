@@ -25,21 +25,20 @@ def footprints(
     """
     poses = np.asarray(rig_from_world, dtype=np.float64)
     border = _unit_square_border(9)
-    planes = half_depth * np.array([[-1.0], [1.0]])
+    planes = half_depth * np.array([-1.0, 1.0])[:, None, None]
     boxes = np.empty((len(poses), len(rig.cameras), 2, 2))
     placed = zip(rig.refractive_cameras(), known_cam_from_rig(rig), strict=True)
     for c, (camera, cam_from_rig) in enumerate(placed):
         rays = camera.ray_from_img(border * [camera.width, camera.height])
         usable = np.isfinite(rays[1]).all(axis=1)
-        for f, pose in enumerate(poses):
-            world_from_cam = rigid3.inverse(rigid3.compose(cam_from_rig, pose))
-            origins = rigid3.transform(world_from_cam, rays[0][usable])
-            dirs = rigid3.rotate(world_from_cam, rays[1][usable])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                far = (planes - origins[:, 2]) / dirs[:, 2]  # (2, rays)
-            far = np.where((far > 0.0) & (far < max_range), far, max_range)
-            hits = origins[:, :2] + far[..., None] * dirs[:, :2]
-            boxes[f, c] = hits.min(axis=(0, 1)), hits.max(axis=(0, 1))
+        world_from_cam = rigid3.inverse(rigid3.compose(cam_from_rig, poses))[:, None]
+        origins = rigid3.transform(world_from_cam, rays[0][usable])  # (F, rays, 3)
+        dirs = rigid3.rotate(world_from_cam, rays[1][usable])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (planes - origins[..., 2]) / dirs[..., 2]  # (2, F, rays)
+        far = np.where((far > 0.0) & (far < max_range), far, max_range)
+        hits = origins[..., :2] + far[..., None] * dirs[..., :2]
+        boxes[:, c, 0], boxes[:, c, 1] = hits.min(axis=(0, 2)), hits.max(axis=(0, 2))
     return boxes
 
 

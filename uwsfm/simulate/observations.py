@@ -14,12 +14,13 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
-from uwsfm.scene import Scene
+from uwsfm.scene import IndexArray, Scene
 from uwsfm.simulate.footprints import footprints
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rigs import known_cam_from_rig
 
 MAX_ROUNDS = 50
+FRAMES_AT_ONCE = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +112,8 @@ def simulate_scene(
             half_depth=3.0 * relief.stddev,
             max_range=options.max_range,
         ),
+        options.max_range,
+        float(np.cos(np.radians(options.max_incidence_deg))),
     )
     points, table = _draw_points(dive, options, rng)
     truth = Scene.from_arrays(
@@ -133,6 +136,8 @@ class _Dive:
     rig_from_world: Array
     relief: Relief
     boxes: Array  # (F, C, 2, 2), see footprints
+    max_range: float
+    min_cos: float
 
 
 def _draw_points(
@@ -146,7 +151,7 @@ def _draw_points(
     num_points = 0
     for _ in range(MAX_ROUNDS):
         xy = rng.uniform(low, high, size=(options.num_points, 2))
-        seen = _observe(dive, xy, options)
+        seen = _observe(dive, xy)
         if options.detection_rate < 1.0:
             seen = seen[rng.uniform(size=len(seen)) < options.detection_rate]
         point_idx = seen[:, 0].astype(np.int64)
@@ -169,40 +174,51 @@ def _draw_points(
     )
 
 
-def _observe(dive: _Dive, xy_in_world: Array, options: ObservationOptions) -> Array:
+def _observe(dive: _Dive, xy_in_world: Array) -> Array:
     """Rows (n, 5) [point, frame, camera, x, y] of what is visible of the floor."""
     points = dive.relief.points(xy_in_world)
     normals = dive.relief.normals(xy_in_world)
-    min_cos = np.cos(np.radians(options.max_incidence_deg))
+    by_x = np.argsort(xy_in_world[:, 0], kind="stable")
+    sorted_xy = xy_in_world[by_x]
     rows = []
-    for f, pose in enumerate(dive.rig_from_world):
-        for c, camera in enumerate(dive.cameras):
-            low, high = dive.boxes[f, c]
-            near = ((xy_in_world >= low) & (xy_in_world <= high)).all(axis=1)
-            candidate = np.flatnonzero(near)
-            cam_from_world = rigid3.compose(dive.cam_from_rig[c], pose)
-            in_cam = rigid3.transform(cam_from_world, points[candidate])
-            ranges = np.linalg.norm(in_cam, axis=1)
-            facing = -np.sum(
-                in_cam * rigid3.rotate(cam_from_world, normals[candidate]), axis=1
-            )
-            xy, valid = camera.img_from_point(in_cam)
-            size = np.array([camera.width, camera.height])
-            with np.errstate(invalid="ignore"):
-                inside = ((xy >= 0.0) & (xy <= size)).all(axis=1)
-            seen = valid & inside & (ranges <= options.max_range)
-            seen &= facing >= min_cos * ranges
-            rows.append(
-                np.column_stack(
-                    [
-                        candidate[seen],
-                        np.full(seen.sum(), f),
-                        np.full(seen.sum(), c),
-                        xy[seen],
-                    ]
-                )
-            )
+    for first in range(0, len(dive.rig_from_world), FRAMES_AT_ONCE):
+        frames = range(first, min(first + FRAMES_AT_ONCE, len(dive.rig_from_world)))
+        block = []
+        for c in range(len(dive.cameras)):
+            near = [_inside(sorted_xy, dive.boxes[f, c]) for f in frames]
+            candidate = by_x[np.concatenate(near)]
+            frame = np.repeat(frames, [len(part) for part in near])
+            xy, seen = _views(dive, frame, c, points[candidate], normals[candidate])
+            frame, camera = frame[seen], np.full(np.count_nonzero(seen), c)
+            block.append(np.column_stack([candidate[seen], frame, camera, xy[seen]]))
+        table = np.concatenate(block)
+        rows.append(table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))])
     return np.concatenate(rows)
+
+
+def _inside(sorted_xy: Array, box: Array) -> IndexArray:
+    """Indices of the rows (n, 2), which rise in x, within a box [low, high]."""
+    first, last = np.searchsorted(sorted_xy[:, 0], box[:, 0])
+    y = sorted_xy[first:last, 1]
+    return first + np.flatnonzero((y >= box[0, 1]) & (y <= box[1, 1]))
+
+
+def _views(
+    dive: _Dive, frame: IndexArray, camera_idx: int, points: Array, normals: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (n, 2) of points (n, 3) in as many frames, and whether they are seen."""
+    camera = dive.cameras[camera_idx]
+    cams_from_world = rigid3.compose(dive.cam_from_rig[camera_idx], dive.rig_from_world)
+    cam_from_world = cams_from_world[frame]
+    in_cam = rigid3.transform(cam_from_world, points)
+    ranges = np.linalg.norm(in_cam, axis=1)
+    facing = -np.sum(in_cam * rigid3.rotate(cam_from_world, normals), axis=1)
+    xy, valid = camera.img_from_point(in_cam)
+    size = np.array([camera.width, camera.height])
+    with np.errstate(invalid="ignore"):
+        inside = ((xy >= 0.0) & (xy <= size)).all(axis=1)
+    seen = valid & inside & (ranges <= dive.max_range)
+    return xy, seen & (facing >= dive.min_cos * ranges)
 
 
 def _with_noise(
