@@ -28,6 +28,7 @@ from uwsfm.known_lengths import KnownLengths
 from uwsfm.pipeline import (
     WORK,
     checked_rig,
+    compiled,
     housing_warnings,
     locked,
     output_folder,
@@ -151,6 +152,7 @@ class _Job:
     options: Mapping[str, Any]
 
     def run(self, model: ModelStart | None) -> HousingResult:
+        compiled(self.front_end.threads, self.progress)
         if self.start == "pairs":
             calibration = self._from_pairs()
         else:

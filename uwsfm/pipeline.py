@@ -35,6 +35,7 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
+from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
@@ -168,10 +169,11 @@ class _Job:
 
     def run(self) -> ReconstructResult:
         out = self.out
+        timings = compiled(self.options.threads, self.progress)
         start = perspective_start(
             self.rig, self.images, out / WORK, self.options, self.progress
         )
-        timings = dict(start.summary["timings_s"])
+        timings.update(start.summary["timings_s"])
         clock = time.perf_counter()
         arrays = start.arrays()
         refined = self._refined(start, arrays)
@@ -204,6 +206,12 @@ class _Job:
             lengths=lengths,
             **self.calibration,
         )
+
+
+def compiled(num_threads: int, progress: Progress) -> dict[str, float]:
+    """What the first run costs, as a part of a summary's times; empty in all others."""
+    seconds = compile_kernels(num_threads, progress)
+    return {"compiling kernels": seconds} if seconds else {}
 
 
 def export_points(model: Model, path: Path, calibration: CalibrationResult) -> None:

@@ -33,6 +33,7 @@ from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import (
     checked_rig,
+    compiled,
     export_points,
     housing_warnings,
     locked,
@@ -51,6 +52,7 @@ from uwsfm.sfm.model_database import (
     with_database,
 )
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
+from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
@@ -200,6 +202,7 @@ class _Job:
     timings: dict[str, float]
 
     def run(self, options: dict[str, Any]) -> RefineResult:
+        self.timings.update(compiled(thread_count(-1), self.progress))
         clock = time.perf_counter()
         tracks = self.start.tracks
         refined = self._refined(tracks, None, options)

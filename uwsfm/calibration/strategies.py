@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import scipy.optimize
 from numpy.typing import NDArray
 
 from uwsfm.errors import UwsfmError
@@ -52,11 +51,13 @@ def minimize_nested(
     gain half a per cent of what is missing at a time; the same end is found here as the
     root of the distances' change, by Powell's hybrid method, in some ten passes.
     """
+    from scipy.optimize import root  # heavy, and only this strategy needs it
+
     loops = NestedLoops(layout, options, priors)
     passes = _Passes(loops, state, report)
     if not np.any(loops.free):
         return loops.settle(state)
-    found = scipy.optimize.root(
+    found = root(
         passes.change,
         np.maximum(state.ports[loops.free, 3], MIN_START),
         method="hybr",

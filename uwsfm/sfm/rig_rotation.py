@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -85,6 +84,8 @@ def correct_rotations(
             misfit_before=0.0,
             misfit_after=0.0,
         )
+    from scipy.optimize import least_squares  # heavy, and no resumed run needs it
+
     used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
 
     def turned(delta: Array) -> Array:

@@ -1,0 +1,151 @@
+"""Machine code for all kernels of a reconstruction, made before it is needed.
+
+Numba's compiler holds Python's global lock: threads do not help, processes do. Each
+does a small simulated job, whose kernels stay in the cache for all that comes later.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from filelock import FileLock
+from numba.core import config
+
+from uwsfm._jit import CACHE_DIR
+from uwsfm._progress import Progress, silent
+from uwsfm.scene import Scene
+
+STEP = "compiling kernels (first run only)"
+DONE = "compiled"
+"""File in the cache that says that nothing is left to compile."""
+POLL_SECONDS = 0.2
+
+logger = logging.getLogger(__name__)
+
+
+def compile_kernels(num_threads: int = 2, progress: Progress = silent) -> float:
+    """Compile what the cache lacks; a second process at the same time waits.
+
+    Without a cache, or where compilation is turned off, nothing is done. Nothing
+    depends on it either: a kernel that is not in the cache is compiled when it is
+    called.
+
+    Args:
+        num_threads: Processes to use, one per job at most.
+        progress: Called with seconds.
+
+    Returns:
+        How long it took, seconds.
+    """
+    off = config.DISABLE_JIT  # type: ignore[attr-defined]
+    if CACHE_DIR is None or off or (CACHE_DIR / DONE).exists():
+        return 0.0
+    start = time.monotonic()
+    with FileLock(CACHE_DIR / f"{DONE}.lock"):
+        if (CACHE_DIR / DONE).exists():
+            return time.monotonic() - start
+        if _run_all(
+            max(1, num_threads),
+            lambda: progress(STEP, int(time.monotonic() - start), None),
+        ):
+            (CACHE_DIR / DONE).touch()
+    return time.monotonic() - start
+
+
+def _run_all(num_processes: int, watch: Callable[[], None]) -> bool:
+    """Run all jobs in processes; whether all succeeded."""
+    waiting, failed = list(JOBS), False
+    running: dict[str, subprocess.Popen[str]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < num_processes:
+                name = waiting.pop(0)
+                running[name] = _start(name)
+            watch()
+            time.sleep(POLL_SECONDS)
+            for name, process in list(running.items()):
+                if process.poll() is not None:
+                    _, errors = running.pop(name).communicate()
+                    if process.returncode != 0:
+                        failed = True
+                        logger.warning("compiling %s failed: %s", name, errors)
+    finally:
+        for process in running.values():
+            process.kill()
+            process.communicate()
+    return not failed
+
+
+def _start(name: str) -> subprocess.Popen[str]:
+    paths = os.pathsep.join(path for path in sys.path if path)
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__, name],
+        env={**os.environ, "PYTHONPATH": paths},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _adjustment() -> None:
+    """The kernels of the last adjustment, its errors and its uncertainties."""
+    from uwsfm.sfm.refine import refine_scene
+    from uwsfm.simulate.rigs import sample_rig
+
+    refine_scene(_dive(), sample_rig())
+
+
+def _mapping() -> None:
+    """The kernels of poses first, then the mapper as a whole.
+
+    When it comes to its adjustments, the other job has compiled their kernels.
+    """
+    from uwsfm.sfm.absolute_pose import estimate_rig_pose
+    from uwsfm.sfm.options import StartOptions
+    from uwsfm.sfm.simulated import frames_of, write_features
+    from uwsfm.sfm.start import start_from_matches
+    from uwsfm.sfm.steps import Steps
+    from uwsfm.simulate.rigs import sample_rig
+
+    rig, scene = sample_rig(), _dive()
+    rows = scene.frame_idx == 0
+    estimate_rig_pose(
+        scene.cameras,
+        scene.cam_from_rig,
+        scene.camera_idx[rows],
+        scene.xy[rows],
+        scene.points[scene.point_idx[rows]],
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        steps = Steps(Path(folder))
+        frames = frames_of(rig, scene.num_frames, steps.work_dir)
+        write_features(steps.work_dir / "database.db", scene, frames, wrong=0.1)
+        options = StartOptions(mapper="refractive", num_threads=1)
+        start_from_matches(rig, frames, steps, "", options)
+
+
+def _dive() -> Scene:
+    from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
+    from uwsfm.simulate.rigs import sample_rig
+    from uwsfm.simulate.trajectories import rich_motion
+
+    return simulate_scene(
+        sample_rig(),
+        rich_motion(8),
+        Relief(stddev=0.15, correlation_length=0.4),
+        ObservationOptions(num_points=500, noise_px=0.3),
+    ).scene
+
+
+JOBS: dict[str, Callable[[], None]] = {"adjustment": _adjustment, "mapping": _mapping}
+
+if __name__ == "__main__":
+    JOBS[sys.argv[1]]()
