@@ -9,6 +9,7 @@ from uwsfm.sfm.images import Frames
 from uwsfm.sfm.match_blocks import match_block, pair_blocks
 from uwsfm.sfm.matching import frame_pairs, image_pairs
 from uwsfm.sfm.options import MatchOptions
+from uwsfm.sfm.retrieval import similar_frames
 
 
 def dive(num_frames: int) -> Frames:
@@ -34,6 +35,9 @@ def test_long_dives_are_matched_with_their_neighbours():
     assert all((i, i) in pairs for i in range(num_frames))
     distances = {j - i for i, j in pairs}
     assert distances == {*range(11), 16, 32, 64, 128, 256}
+    loops = list(frame_pairs(num_frames, MatchOptions(overlap=10), [(3, 403)]))
+    assert set(loops) - set(pairs) == {(3, 403)}
+    assert len(set(loops)) == len(loops)
 
 
 @pytest.mark.parametrize("strategy", ["auto", "exhaustive", "sequential"])
@@ -85,3 +89,32 @@ def test_matches_do_not_depend_on_the_block(tmp_path):
         assert len(matches) > 300  # of about 544 common rows
         assert np.mean(np.abs(a.astype(int) - b).max(axis=1) <= 18) > 0.99
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dive_that_comes_back_finds_the_frames_it_saw_before():
+    """Two rounds over the same floor, half of the features new each time.
+
+    Each frame shows half of the 300 features of its place, so that two rounds share a
+    quarter, among as many that no other frame has. Chance would meet one frame in 20.
+    """
+    rng = np.random.default_rng(3)
+    half = 40
+    floor = rng.gamma(0.6, 60.0, (half, 300, 128)).clip(0, 255)
+    # Neighbourhoods differ in what they are made of, as sand, rock and weed do.
+    floor *= rng.gamma(2.0, 0.5, (half, 1, 128))
+
+    def images(frame: int):
+        rows = floor[frame % half][rng_of(frame).permutation(300)[:150]]
+        strange = rng_of(frame).gamma(0.6, 60.0, (150, 128))
+        noisy = np.vstack([rows, strange]) + rng_of(frame).normal(0.0, 8.0, (300, 128))
+        return [noisy.clip(0, 255).astype(np.uint8)]
+
+    def rng_of(frame: int) -> np.random.Generator:
+        return np.random.default_rng(frame)
+
+    pairs = similar_frames(images, 2 * half, num_similar=3, min_step=11)
+    assert all(j - i >= 11 for i, j in pairs)
+    assert len(pairs) <= 3 * 2 * half
+    met = {i for i, j in pairs if j == i + half}
+    assert len(met) > 0.9 * half
+    assert pairs == similar_frames(images, 2 * half, num_similar=3, min_step=11)

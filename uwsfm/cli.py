@@ -108,7 +108,10 @@ def reconstruct(
     ] = None,
     matching: Annotated[
         Literal["auto", "exhaustive", "sequential"],
-        typer.Option(help="Which frames are compared; auto: by their number."),
+        typer.Option(
+            help="Which frames are compared; sequential: neighbours and frames that "
+            "look alike; auto: exhaustive up to 60 frames."
+        ),
     ] = "auto",
     matcher: Annotated[
         Literal["colmap", "paper"],

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from itertools import combinations_with_replacement
 from pathlib import Path
 
 import pycolmap
@@ -16,32 +19,83 @@ from uwsfm.sfm.images import Frames
 from uwsfm.sfm.match_blocks import Matches, Pair, match_block, pair_blocks
 from uwsfm.sfm.options import MatchOptions, thread_count
 from uwsfm.sfm.paper_matching import match_pairs
+from uwsfm.sfm.retrieval import similar_frames
+
+logger = logging.getLogger(__name__)
 
 
-def frame_pairs(num_frames: int, options: MatchOptions) -> Iterator[tuple[int, int]]:
-    """Pairs of frames to match (i <= j), each with itself first."""
-    exhaustive = options.strategy == "exhaustive" or (
+def is_exhaustive(num_frames: int, options: MatchOptions) -> bool:
+    """Whether all frames are compared."""
+    return options.strategy == "exhaustive" or (
         options.strategy == "auto" and num_frames <= options.max_exhaustive_frames
     )
-    steps = set(range(options.overlap + 1))
+
+
+def frame_pairs(
+    num_frames: int, options: MatchOptions, similar: Iterable[Pair] = ()
+) -> Iterator[Pair]:
+    """Pairs of frames to match (i <= j), each with itself first."""
+    if is_exhaustive(num_frames, options):
+        yield from combinations_with_replacement(range(num_frames), 2)
+        return
+    steps = set(range(1, options.overlap + 1))
     steps.update(2**k for k in range(num_frames.bit_length()))
+    alike: defaultdict[int, set[int]] = defaultdict(set)
+    for i, j in similar:
+        alike[i].add(j)
     for i in range(num_frames):
         yield i, i
-        for j in range(i + 1, num_frames):
-            if exhaustive or j - i in steps:
-                yield i, j
+        partners = alike[i].union(i + step for step in steps)
+        yield from ((i, j) for j in sorted(partners) if j < num_frames)
 
 
-def image_pairs(frames: Frames, options: MatchOptions) -> list[tuple[str, str]]:
+def image_pairs(
+    frames: Frames, options: MatchOptions, similar: Iterable[Pair] = ()
+) -> list[tuple[str, str]]:
     """Pairs of images: every camera of one frame with every camera of the other."""
     cameras = range(len(frames.folders))
     return [
         (frames.image_name(a, i), frames.image_name(b, j))
-        for i, j in frame_pairs(len(frames.names), options)
+        for i, j in frame_pairs(len(frames.names), options, similar)
         for a in cameras
         for b in cameras
         if i < j or a < b
     ]
+
+
+def chosen_pairs(
+    frames: Frames, database_path: Path, options: MatchOptions
+) -> list[tuple[str, str]]:
+    """`image_pairs`, with the frames that look alike if they are many.
+
+    Args:
+        frames: The images.
+        database_path: With their features.
+        options: Which pairs.
+    """
+    num_frames = len(frames.names)
+    if is_exhaustive(num_frames, options):
+        logger.info("matching: all pairs of %d frames", num_frames)
+        return image_pairs(frames, options)
+    with opened(database_path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        similar = similar_frames(
+            lambda f: (
+                database.read_descriptors(ids[frames.image_name(c, f)]).data
+                for c in range(len(frames.folders))
+            ),
+            num_frames,
+            num_similar=options.num_similar,
+            min_step=options.overlap + 1,
+        )
+    logger.info(
+        "matching: %d frames in sequence, each with %d neighbours, frames 16, 32, ... "
+        "away, and %d pairs of frames that look alike",
+        num_frames,
+        options.overlap,
+        len(similar),
+    )
+    return image_pairs(frames, options, similar)
 
 
 def match_features(
@@ -63,7 +117,7 @@ def match_features(
         num_threads: -1 for all cores. The matches do not depend on it.
         progress: Called with the step "matching".
     """
-    pairs = image_pairs(frames, options)
+    pairs = chosen_pairs(frames, database_path, options)
     if options.matcher == "paper":
         match_pairs(
             pairs,

@@ -55,12 +55,16 @@ class MatchOptions:
     """Which images are matched, and how."""
 
     strategy: Matching = "auto"
-    """Exhaustive compares all frames; sequential only neighbours, by file name."""
+    """Exhaustive compares all frames; sequential neighbours, by file name, and frames
+    that look alike."""
     max_exhaustive_frames: int = 60
     """Where "auto" changes to sequential: the cost grows with the square."""
     overlap: int = 10
-    """Sequential: neighbours on each side; then those 16, 32, ... frames away, which
-    close the loops of a slow survey."""
+    """Sequential: neighbours on each side; then those 16, 32, ... frames away."""
+    num_similar: int = 5
+    """Sequential: other frames that look most like a frame, which close loops. On 42
+    photographs around a coral, 40 of 42 so meet a frame 11 or more away that sees the
+    same, in a quarter of all pairs; 8 find no more, 3 find 38."""
     matcher: Matcher = "colmap"
     """"colmap": its own, without geometry. "paper": nearest neighbours in kd-trees, and
     a tolerant fundamental matrix: half the wrong matches or fewer, at 3 to 6 times the
@@ -79,6 +83,11 @@ class MatchOptions:
             raise InputError(
                 f"matcher must be one of {', '.join(get_args(Matcher))}, "
                 f"got {self.matcher!r}"
+            )
+        if self.overlap < 1 or self.num_similar < 0:
+            raise InputError(
+                f"overlap must be positive and num_similar not negative, got "
+                f"{self.overlap} and {self.num_similar}"
             )
         error_px = self.fundamental_max_error_px
         if error_px is not None and not 0.0 < error_px < math.inf:

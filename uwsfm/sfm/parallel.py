@@ -23,7 +23,7 @@ from uwsfm.sfm.background import opened, remove_database
 from uwsfm.sfm.features import check_complete, extract_images
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks
-from uwsfm.sfm.matching import image_pairs
+from uwsfm.sfm.matching import chosen_pairs
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 from uwsfm.sfm.steps import fingerprint
 from uwsfm.tasks import Workers
@@ -130,9 +130,10 @@ def match_elsewhere(
     """`match_features` by workers, with COLMAP's matcher; finished blocks are kept."""
     folder = database_path.absolute().parent / MATCHES
     folder.mkdir(exist_ok=True)
+    names = chosen_pairs(frames, database_path, options)
     with opened(database_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        pairs = [(ids[a], ids[b]) for a, b in image_pairs(frames, options)]
+        pairs = [(ids[a], ids[b]) for a, b in names]
         todo = [pair for pair in pairs if not database.exists_matches(*pair)]
         blocks = pair_blocks(todo, [ids[name] for name in frames.image_names()], 1)
         paths = [folder / f"{fingerprint(block)}.npz" for block in blocks]
