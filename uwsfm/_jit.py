@@ -72,6 +72,17 @@ def kernel(function: Function) -> Function:
 _LANE_MATH = {"nsz", "arcp", "contract", "reassoc"}
 
 
+def fused(function: Function) -> Function:
+    """Compile a kernel whose sums may be fused and regrouped, as those of lanes are."""
+    compiled: Any = numba.njit(
+        cache=CACHE_DIR is not None,
+        nogil=True,
+        error_model="numpy",
+        fastmath=_LANE_MATH,
+    )
+    return compiled(function)
+
+
 def lane(function: Function) -> Function:
     """Compile a formula of one lane, or a loop over lanes, for SIMD.
 

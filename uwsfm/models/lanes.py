@@ -24,8 +24,9 @@ LENS_V: Final = 13
 """d(py) / dv, 3 rows."""
 JAC_U: Final = 16
 """d(px) by point (3), port (7, see `projection.JAC_SIZE`), then what `residuals` adds:
-point in the rig (3), turn (3) and translation (3) of cam_from_rig."""
-NUM_COLUMNS: Final = 19
+point in the rig (3), turn (3) and translation (3) of cam_from_rig, lens (12), and the
+residual."""
+NUM_COLUMNS: Final = 32
 JAC_V: Final = JAC_U + NUM_COLUMNS
 """d(py), likewise."""
 NUM_ROWS: Final = JAC_V + NUM_COLUMNS

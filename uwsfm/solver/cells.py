@@ -11,7 +11,6 @@ from uwsfm.models.status import VALID
 from uwsfm.residuals import point_3d, reprojection, virtual_camera
 from uwsfm.solver.error_models import (
     POINT_3D,
-    REPROJECTION,
     VIRTUAL_CAMERA_TANGENTIAL,
 )
 from uwsfm.solver.losses import INVALID_PX, rho
@@ -35,20 +34,13 @@ def cell_cost(layout, state, error, c, x, y, z, loss, scale):
         value, _ = rho(square, loss, scale)
         return 0.5 * value, 1
     cost, valid = 0.0, 0
+    sheet = error.code == VIRTUAL_CAMERA_TANGENTIAL
     for i in range(first, last):
         k = layout.camera[i]
-        cam, lens, port = state.cams[k], state.lenses[k], state.ports[k]
-        if error.code == REPROJECTION:
-            status, ex, ey = reprojection.residual(
-                x, y, z, layout.xy[i], cam, lens, port
-            )
-            square = ex * ex + ey * ey
-        else:
-            sheet = error.code == VIRTUAL_CAMERA_TANGENTIAL
-            status, ex, ey, ez = virtual_camera.residual(
-                x, y, z, error.dirs[i], cam, port, sheet
-            )
-            square = error.unit * error.unit * (ex * ex + ey * ey + ez * ez)
+        status, ex, ey, ez = virtual_camera.residual(
+            x, y, z, error.dirs[i], state.cams[k], state.ports[k], sheet
+        )
+        square = error.unit * error.unit * (ex * ex + ey * ey + ez * ez)
         value = price
         if status == VALID:
             value, _ = rho(square, loss, scale)
@@ -117,18 +109,6 @@ def scatter_blocks(layout, work, out):
                 out.border[col, other] += work.blocks[camera, s, t]
                 if t < s:
                     out.border[other, col] += work.blocks[camera, s, t]
-
-
-@kernel
-def add_reprojection(layout, state, c, x, y, z, loss, scale, work):
-    """Reprojection errors of a cell."""
-    for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-        status, rx, ry = linearized_residual(
-            layout, state, i, x, y, z, work.j_port, work.j_rig, work.j_border
-        )
-        if status == VALID:
-            _, weight = rho(rx * rx + ry * ry, loss, scale)
-            _add_rows(layout, layout.camera[i], 0, rx, ry, weight, work)
 
 
 @kernel

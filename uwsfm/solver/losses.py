@@ -4,7 +4,8 @@ import math
 
 from uwsfm._jit import kernel
 
-LOSS_CODES = {"l2": 0, "cauchy": 1}
+L2, CAUCHY = 0, 1
+LOSS_CODES = {"l2": L2, "cauchy": CAUCHY}
 
 INVALID_PX = 100.0
 """What an observation costs that cannot be projected: as a residual of this size. It
@@ -15,7 +16,7 @@ water."""
 @kernel
 def rho(s, loss, scale):
     """(rho(s), rho'(s)): l2 is s, cauchy is c^2 log(1 + s / c^2)."""
-    if loss == 1:
+    if loss == CAUCHY:
         c2 = scale * scale
         return c2 * math.log1p(s / c2), 1.0 / (1.0 + s / c2)
     return s, 1.0

@@ -15,18 +15,26 @@ import numpy as np
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.projection import JAC_SIZE
 from uwsfm.residuals.border import BORDER_SIZE
-from uwsfm.residuals.reprojection import point_in_rig, residual
+from uwsfm.residuals.reprojection import point_in_rig
+from uwsfm.solver.assembly import add_cell, assemble, new_sums, rotation, scatter
 from uwsfm.solver.cells import (
     add_point_3d,
-    add_reprojection,
     add_virtual_camera,
     cell_cost,
     scatter_blocks,
 )
-from uwsfm.solver.error_models import POINT_3D, REPROJECTION
+from uwsfm.solver.chunks import (
+    chunk_end,
+    cost_of_errors,
+    evaluate,
+    evaluate_with_jac,
+    gather,
+    new_chunk,
+)
+from uwsfm.solver.error_models import POINT_3D, REPROJECTION, ErrorModel
 from uwsfm.solver.layout import Layout
+from uwsfm.solver.state import KernelState
 
 MIN_DIAGONAL = 1e-6
 
@@ -72,64 +80,25 @@ def empty_normal_equations(layout: Layout) -> NormalEquations:
 
 
 @kernel
-def _pose_times(x, y, z, mat, col):
-    """M^T times a column of a (3, .) matrix: torque q x m, then m."""
-    a, b, c = mat[0, col], mat[1, col], mat[2, col]
-    return y * c - z * b, z * a - x * c, x * b - y * a, a, b, c
-
-
-@kernel
-def _expand_cell(x, y, z, frame, p, c, f, work, out):
-    """Expand a cell's sums to its frame, its point and their couplings."""
-    hess, grad, couple = work.hess, work.grad, work.couple
-    pose_hess = np.empty((6, 3))  # M^T H
-    for b in range(3):
-        m0, m1, m2, m3, m4, m5 = _pose_times(x, y, z, hess, b)
-        pose_hess[0, b], pose_hess[1, b], pose_hess[2, b] = m0, m1, m2
-        pose_hess[3, b], pose_hess[4, b], pose_hess[5, b] = m3, m4, m5
-    for a in range(6):
-        h0, h1, h2 = pose_hess[a, 0], pose_hess[a, 1], pose_hess[a, 2]
-        out.frames[f, a, 0] += y * h2 - z * h1
-        out.frames[f, a, 1] += z * h0 - x * h2
-        out.frames[f, a, 2] += x * h1 - y * h0
-        out.frames[f, a, 3] += h0
-        out.frames[f, a, 4] += h1
-        out.frames[f, a, 5] += h2
-        for b in range(3):
-            out.cells[c, a, b] = h0 * frame[b] + h1 * frame[4 + b] + h2 * frame[8 + b]
-    g = out.frames_grad[f]
-    g[0] += y * grad[2] - z * grad[1]
-    g[1] += z * grad[0] - x * grad[2]
-    g[2] += x * grad[1] - y * grad[0]
-    for a in range(3):
-        g[3 + a] += grad[a]
-        out.points_grad[p, a] += (
-            frame[a] * grad[0] + frame[4 + a] * grad[1] + frame[8 + a] * grad[2]
-        )
-        for b in range(3):
-            # R^T H R = R^T (lower half of M^T H R)
-            out.points[p, a, b] += (
-                frame[a] * out.cells[c, 3, b]
-                + frame[4 + a] * out.cells[c, 4, b]
-                + frame[8 + a] * out.cells[c, 5, b]
-            )
+def _add_couplings(x, y, z, frame, p, f, couple, out):
+    """Couplings of a cell (3, B) to the border, from its frame and its point."""
+    rows = out.frames_border[f]
     for k in range(couple.shape[1]):
-        m0, m1, m2, m3, m4, m5 = _pose_times(x, y, z, couple, k)
-        column = out.frames_border[f]
-        column[0, k] += m0
-        column[1, k] += m1
-        column[2, k] += m2
-        column[3, k] += m3
-        column[4, k] += m4
-        column[5, k] += m5
-        for a in range(3):
-            out.points_border[p, a, k] += (
-                frame[a] * m3 + frame[4 + a] * m4 + frame[8 + a] * m5
+        a, b, c = couple[0, k], couple[1, k], couple[2, k]
+        rows[0, k] += y * c - z * b
+        rows[1, k] += z * a - x * c
+        rows[2, k] += x * b - y * a
+        rows[3, k] += a
+        rows[4, k] += b
+        rows[5, k] += c
+        for i in range(3):
+            out.points_border[p, i, k] += (
+                frame[i] * a + frame[4 + i] * b + frame[8 + i] * c
             )
 
 
 class Work(NamedTuple):
-    """Scratch of `linearize`: sums of a cell, of a camera, Jacobians of a row."""
+    """Scratch of other errors: sums of a cell, of a camera, Jacobians of a row."""
 
     hess: Array
     """(3, 3), lower triangle."""
@@ -139,7 +108,6 @@ class Work(NamedTuple):
     """(C, BORDER_SIZE, BORDER_SIZE), lower triangles of what is free."""
     block_grads: Array
     free: Array
-    j_port: Array
     j_rig: Array
     j_border: Array
     j_cell: Array
@@ -154,7 +122,6 @@ def _work(num_border, num_cameras, largest_cell):
         np.zeros((num_cameras, BORDER_SIZE, BORDER_SIZE)),
         np.zeros((num_cameras, BORDER_SIZE)),
         np.empty((2, BORDER_SIZE)),
-        np.empty((2, JAC_SIZE)),
         np.zeros((4, 3)),  # a virtual camera's error has three rows and one of zeros
         np.zeros((4, BORDER_SIZE)),
         np.zeros((largest_cell, 3, BORDER_SIZE)),
@@ -162,31 +129,65 @@ def _work(num_border, num_cameras, largest_cell):
 
 
 @kernel
-def linearize(layout, state, error, loss, scale, out):
-    """Fill zeroed `NormalEquations` at a state, with weights rho'(s)."""
+def _linearize_in_space(layout, state, error, loss, scale, out):
+    """`linearize` of errors that are not in the image, cell by cell."""
     # A camera may have matched two features of an image to one point.
     largest_cell = np.diff(layout.cell_start).max()
     work = _work(len(out.border_grad), len(state.cams), largest_cell)
+    hess, grad = work.hess, work.grad
     for p in range(len(layout.point_start) - 1):
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             f = layout.cell_frame[c]
-            x, y, z = point_in_rig(state.frames[f], state.points[p])
-            work.hess[:], work.grad[:], work.couple[:] = 0.0, 0.0, 0.0
-            if error.code == REPROJECTION:
-                add_reprojection(layout, state, c, x, y, z, loss, scale, work)
-            elif error.code == POINT_3D:
+            frame = state.frames[f]
+            x, y, z = point_in_rig(frame, state.points[p])
+            hess[:], grad[:], work.couple[:] = 0.0, 0.0, 0.0
+            if error.code == POINT_3D:
                 add_point_3d(layout, state, error, c, x, y, z, loss, scale, work, out)
             else:
                 add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work)
-            work.hess[0, 1], work.hess[0, 2] = work.hess[1, 0], work.hess[2, 0]
-            work.hess[1, 2] = work.hess[2, 1]
-            _expand_cell(x, y, z, state.frames[f], p, c, f, work, out)
+            lower = (hess[0, 0], hess[1, 0], hess[1, 1], hess[2, 0], hess[2, 1])
+            cell = (*lower, hess[2, 2], grad[0], grad[1], grad[2])
+            turn = rotation(state.frames, f)
+            add_cell(x, y, z, turn, p, c, f, cell, out.frames, out.frames_grad, out)
+            _add_couplings(x, y, z, frame, p, f, work.couple, out)
     scatter_blocks(layout, work, out)
 
 
 @kernel
-def total_cost(layout, state, error, loss, scale):
-    """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
+def _linearize_points(layout, state, loss, scale, begin, end, out):
+    """Reprojection errors of points begin to end: their blocks, and `Sums`."""
+    chunk, sums = new_chunk(layout), new_sums(layout)
+    p = begin
+    while p < end:
+        last = chunk_end(layout, p, end)
+        first = gather(layout, state, p, last, chunk)
+        evaluate_with_jac(layout, state, first, loss, scale, sums.blocks, chunk)
+        assemble(layout, state, p, last, first, chunk, sums, out)
+        p = last
+    return sums
+
+
+def linearize(
+    layout: Layout,
+    state: KernelState,
+    error: ErrorModel,
+    loss: int,
+    scale: float,
+    out: NormalEquations,
+) -> None:
+    """Fill zeroed `NormalEquations` at a state, with weights rho'(s)."""
+    if error.code != REPROJECTION:
+        _linearize_in_space(layout, state, error, loss, scale, out)
+        return
+    sums = _linearize_points(
+        layout, state, loss, scale, 0, len(layout.point_start) - 1, out
+    )
+    scatter(layout, sums, out)
+
+
+@kernel
+def _cost_in_space(layout, state, error, loss, scale):
+    """`total_cost` of errors that are not in the image."""
     cost, valid = 0.0, 0
     for p in range(len(layout.point_start) - 1):
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
@@ -198,20 +199,41 @@ def total_cost(layout, state, error, loss, scale):
 
 
 @kernel
+def _cost_of_points(layout, state, loss, scale, begin, end):
+    """Cost and number of valid reprojection errors of points begin to end."""
+    chunk = new_chunk(layout)
+    cost, valid, p = 0.0, 0, begin
+    while p < end:
+        last = chunk_end(layout, p, end)
+        first = gather(layout, state, p, last, chunk)
+        count = layout.cell_start[layout.point_start[last]] - first
+        evaluate(layout, state, first, chunk)
+        part, good = cost_of_errors(chunk.errors, count, loss, scale)
+        cost += part
+        valid += good
+        p = last
+    return cost, valid
+
+
+def total_cost(
+    layout: Layout, state: KernelState, error: ErrorModel, loss: int, scale: float
+) -> tuple[float, int]:
+    """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
+    if error.code != REPROJECTION:
+        return _cost_in_space(layout, state, error, loss, scale)
+    return _cost_of_points(layout, state, loss, scale, 0, len(layout.point_start) - 1)
+
+
+@kernel
 def squared_errors(layout, state, squares):
     """Squared reprojection errors (N,) in sorted order, px^2; NaN where invalid."""
-    for p in range(len(layout.point_start) - 1):
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], state.points[p])
-            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-                k = layout.camera[i]
-                _, rx, ry = residual(
-                    x,
-                    y,
-                    z,
-                    layout.xy[i],
-                    state.cams[k],
-                    state.lenses[k],
-                    state.ports[k],
-                )
-                squares[i] = rx * rx + ry * ry
+    chunk = new_chunk(layout)
+    p, end = 0, len(layout.point_start) - 1
+    while p < end:
+        last = chunk_end(layout, p, end)
+        first = gather(layout, state, p, last, chunk)
+        evaluate(layout, state, first, chunk)
+        for j in range(layout.cell_start[layout.point_start[last]] - first):
+            rx, ry = chunk.errors[j, 0], chunk.errors[j, 1]
+            squares[first + j] = rx * rx + ry * ry
+        p = last

@@ -1,0 +1,203 @@
+"""From rows of Jacobians to normal equations, cell by cell."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwsfm._jit import fused, kernel, lane
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.solver.chunks import COUPLING, GRAD, width
+
+
+class Sums(NamedTuple):
+    """What points share, summed over some of them; W columns for each of C cameras."""
+
+    frames: Array
+    """U (F, 6, 6)"""
+    frames_grad: Array
+    """(F, 6)"""
+    frames_border: Array
+    """(F, C W, 6): B^T, so that what is added together lies together."""
+    blocks: Array
+    """(C, W, W + 1) of each camera against the residual, then itself."""
+    of_point: Array
+    """(C W, 3) scratch: one point against the cameras."""
+
+
+@kernel
+def new_sums(layout):
+    """Zeroed sums of the sizes of a layout."""
+    num_cameras, num_frames = len(layout.free_start) - 1, len(layout.frame_col)
+    w = width(layout)
+    return Sums(
+        np.zeros((num_frames, 6, 6)),
+        np.zeros((num_frames, 6)),
+        np.zeros((num_frames, num_cameras * w, 6)),
+        np.zeros((num_cameras, w, w + 1)),
+        np.zeros((num_cameras * w, 3)),
+    )
+
+
+@lane
+def _torque(x, y, z, a, b, c):
+    """q x m."""
+    return y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@fused
+def _add_couplings(rows, j, k, num_free, x, y, z, frame, f, sums):
+    """What observation j couples to its camera k: its frame f and its point."""
+    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+    of_frame, of_point = sums.frames_border, sums.of_point
+    first = k * sums.blocks.shape[1]
+    for s in range(num_free):
+        at, col = COUPLING + 3 * s, first + s
+        c0, c1, c2 = rows[j, at], rows[j, at + 1], rows[j, at + 2]
+        t0, t1, t2 = _torque(x, y, z, c0, c1, c2)
+        of_frame[f, col, 0] += t0
+        of_frame[f, col, 1] += t1
+        of_frame[f, col, 2] += t2
+        of_frame[f, col, 3] += c0
+        of_frame[f, col, 4] += c1
+        of_frame[f, col, 5] += c2
+        of_point[col, 0] += r11 * c0 + r21 * c1 + r31 * c2
+        of_point[col, 1] += r12 * c0 + r22 * c1 + r32 * c2
+        of_point[col, 2] += r13 * c0 + r23 * c1 + r33 * c2
+
+
+@fused
+def rotation(frames, f):
+    """Nine numbers of the rotation in a row of [R | t]."""
+    return (
+        frames[f, 0],
+        frames[f, 1],
+        frames[f, 2],
+        frames[f, 4],
+        frames[f, 5],
+        frames[f, 6],
+        frames[f, 8],
+        frames[f, 9],
+        frames[f, 10],
+    )
+
+
+@lane
+def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
+    """Row a of M^T H: times M it belongs to the frame, times R to the coupling."""
+    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+    q0, q1, q2 = _torque(x, y, z, m0, m1, m2)
+    frames[f, a, 0] += q0
+    frames[f, a, 1] += q1
+    frames[f, a, 2] += q2
+    frames[f, a, 3] += m0
+    frames[f, a, 4] += m1
+    frames[f, a, 5] += m2
+    w0 = m0 * r11 + m1 * r21 + m2 * r31
+    w1 = m0 * r12 + m1 * r22 + m2 * r32
+    w2 = m0 * r13 + m1 * r23 + m2 * r33
+    cells[c, a, 0], cells[c, a, 1], cells[c, a, 2] = w0, w1, w2
+    return w0, w1, w2
+
+
+@fused
+def add_cell(x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, out):
+    """Expand a cell's sums to its frame, its point and their coupling W = M^T H R.
+
+    Args:
+        x, y, z: the point in the rig.
+        frame: from `rotation`.
+        p, c, f: point, cell and frame.
+        sums_of_cell: H (lower triangle) and g by the point in the rig, 9 scalars.
+        frames, frames_grad, out: added to; the cell's W is written.
+    """
+    h00, h10, h11, h20, h21, h22, g0, g1, g2 = sums_of_cell
+    t00, t10, t20 = _torque(x, y, z, h00, h10, h20)
+    t01, t11, t21 = _torque(x, y, z, h10, h11, h21)
+    t02, t12, t22 = _torque(x, y, z, h20, h21, h22)
+    cells = out.cells
+    _add_pose_row(0, x, y, z, t00, t01, t02, frame, f, c, frames, cells)
+    _add_pose_row(1, x, y, z, t10, t11, t12, frame, f, c, frames, cells)
+    _add_pose_row(2, x, y, z, t20, t21, t22, frame, f, c, frames, cells)
+    a = _add_pose_row(3, x, y, z, h00, h10, h20, frame, f, c, frames, cells)
+    b = _add_pose_row(4, x, y, z, h10, h11, h21, frame, f, c, frames, cells)
+    d = _add_pose_row(5, x, y, z, h20, h21, h22, frame, f, c, frames, cells)
+    q0, q1, q2 = _torque(x, y, z, g0, g1, g2)
+    frames_grad[f, 0] += q0
+    frames_grad[f, 1] += q1
+    frames_grad[f, 2] += q2
+    frames_grad[f, 3] += g0
+    frames_grad[f, 4] += g1
+    frames_grad[f, 5] += g2
+    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+    grad, v = out.points_grad, out.points
+    grad[p, 0] += r11 * g0 + r21 * g1 + r31 * g2
+    grad[p, 1] += r12 * g0 + r22 * g1 + r32 * g2
+    grad[p, 2] += r13 * g0 + r23 * g1 + r33 * g2
+    for k in range(3):  # R^T H R: the lower half of M^T H R, rows a, b, d, is H R
+        v[p, 0, k] += r11 * a[k] + r21 * b[k] + r31 * d[k]
+        v[p, 1, k] += r12 * a[k] + r22 * b[k] + r32 * d[k]
+        v[p, 2, k] += r13 * a[k] + r23 * b[k] + r33 * d[k]
+
+
+@fused
+def _sum_rows(rows, first, last):
+    """J^T W J by the point in the rig (lower triangle), J^T W r: 9 scalars."""
+    h00, h10, h11, h20, h21, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    g0, g1, g2 = 0.0, 0.0, 0.0
+    for j in range(first, last):
+        h00 += rows[j, 0]
+        h10 += rows[j, 1]
+        h11 += rows[j, 2]
+        h20 += rows[j, 3]
+        h21 += rows[j, 4]
+        h22 += rows[j, 5]
+        g0 += rows[j, GRAD]
+        g1 += rows[j, GRAD + 1]
+        g2 += rows[j, GRAD + 2]
+    return h00, h10, h11, h20, h21, h22, g0, g1, g2
+
+
+@fused
+def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
+    """Add the rows of an evaluated chunk to the blocks of its points and the sums."""
+    rows, in_rig, w = chunk.rows, chunk.in_rig, sums.blocks.shape[1]
+    for p in range(first_point, last_point):
+        sums.of_point[:] = 0.0
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            start, end = layout.cell_start[c] - first, layout.cell_start[c + 1] - first
+            f = layout.cell_frame[c]
+            frame = rotation(state.frames, f)
+            x, y, z = in_rig[start, 0], in_rig[start, 1], in_rig[start, 2]
+            cell = _sum_rows(rows, start, end)
+            add_cell(x, y, z, frame, p, c, f, cell, sums.frames, sums.frames_grad, out)
+            for j in range(start, end):
+                k = layout.camera[first + j]
+                num_free = layout.free_start[k + 1] - layout.free_start[k]
+                _add_couplings(rows, j, k, num_free, x, y, z, frame, f, sums)
+        for k in range(len(layout.free_start) - 1):
+            at = layout.free_start[k]
+            for s in range(layout.free_start[k + 1] - at):
+                col = layout.free_col[at + s]
+                for a in range(3):
+                    out.points_border[p, a, col] += sums.of_point[k * w + s, a]
+
+
+@kernel
+def scatter(layout, sums, out):
+    """Add sums to the normal equations, where cameras may share border columns."""
+    w = sums.blocks.shape[1]
+    out.frames[:] += sums.frames
+    out.frames_grad[:] += sums.frames_grad
+    for k in range(len(layout.free_start) - 1):
+        at = layout.free_start[k]
+        for s in range(layout.free_start[k + 1] - at):
+            col = layout.free_col[at + s]
+            out.border_grad[col] += sums.blocks[k, s, 0]
+            for f in range(len(layout.frame_col)):
+                for a in range(6):
+                    out.frames_border[f, a, col] += sums.frames_border[f, k * w + s, a]
+            for t in range(s + 1):
+                other = layout.free_col[at + t]
+                out.border[col, other] += sums.blocks[k, s, t + 1]
+                if t < s:
+                    out.border[other, col] += sums.blocks[k, s, t + 1]

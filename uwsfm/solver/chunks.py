@@ -1,0 +1,245 @@
+"""Reprojection errors of a run of points: gathered by camera, evaluated in lanes.
+
+A chunk is as many points, with all their observations, as keep their rows in the L2
+cache. Row j belongs to the j-th observation of the chunk.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from uwsfm._jit import kernel
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lanes import BLOCK, OK, PX, PY, SIZE, STRIDE, X, Y, Z
+from uwsfm.models.lens import NUM_PARAMS
+from uwsfm.models.projection import JAC_SIZE
+from uwsfm.residuals.border import BORDER_SIZE
+from uwsfm.residuals.reprojection import point_in_rig, residual
+from uwsfm.residuals.reprojection_lanes import (
+    COLUMN_OF_SLOT,
+    RESIDUAL,
+    jac_from_rig,
+    lens_columns,
+    project_from_rig,
+    redo_lane,
+)
+from uwsfm.scene import IndexArray
+from uwsfm.solver.lane_products import (
+    CELL,
+    RES_U,
+    RES_V,
+    multiply_camera,
+    multiply_cells,
+    weigh,
+)
+from uwsfm.solver.losses import CAUCHY, INVALID_PX
+
+CHUNK: Final = 512
+"""Observations, unless one point has more."""
+
+# Columns of a row: H (6, lower triangle) and g (3) by the point in the rig, then the
+# coupling (3) to each free parameter of the camera.
+GRAD: Final = 6
+COUPLING: Final = 9
+
+
+class Chunk(NamedTuple):
+    """Scratch for one chunk of at most M observations by C cameras."""
+
+    rows: Array
+    """(M, COUPLING + 3 W) weighted products; zero where invalid."""
+    errors: Array
+    """(M, 2) residuals in pixels, NaN where invalid."""
+    in_rig: Array
+    """(M, 3) the point of each observation."""
+    bucket: IndexArray
+    """(C, M) the observations of each camera, counted from the chunk's first."""
+    counts: IndexArray
+    """(C,) how many there are."""
+    buffer: Array
+    """Lanes, see `uwsfm.models.lanes`."""
+    products: Array
+    """Lanes, see `uwsfm.solver.lane_products`."""
+    j_lens: Array
+    scalar: tuple[Array, Array, Array]
+    """Scratch of the scalar kernels."""
+
+
+@kernel
+def width(layout):
+    """W: the most columns that are free of one camera."""
+    return np.diff(layout.free_start).max()
+
+
+@kernel
+def new_chunk(layout):
+    """Scratch that the largest chunk of a layout fits in."""
+    num_cameras, largest = len(layout.free_start) - 1, CHUNK
+    for p in range(len(layout.point_start) - 1):
+        first, last = layout.point_start[p], layout.point_start[p + 1]
+        largest = max(largest, layout.cell_start[last] - layout.cell_start[first])
+    columns = COUPLING + 3 * width(layout)
+    return Chunk(
+        np.zeros((largest, columns)),
+        np.empty((largest, 2)),
+        np.empty((largest, 3)),
+        np.empty((num_cameras, largest), dtype=np.int64),
+        np.empty(num_cameras, dtype=np.int64),
+        np.empty(SIZE),
+        np.empty((CELL + columns) * STRIDE),
+        np.empty((2, NUM_PARAMS)),
+        (np.empty((2, JAC_SIZE)), np.empty((2, 3)), np.zeros((2, BORDER_SIZE))),
+    )
+
+
+@kernel
+def chunk_end(layout, p, end):
+    """The point after the last one of the chunk that starts with point p."""
+    first = layout.cell_start[layout.point_start[p]]
+    p += 1
+    while p < end:
+        if layout.cell_start[layout.point_start[p + 1]] - first > CHUNK:
+            break
+        p += 1
+    return p
+
+
+@kernel
+def gather(layout, state, first_point, last_point, chunk):
+    """Move the points to the rig and list the observations of each camera."""
+    chunk.counts[:] = 0
+    first = layout.cell_start[layout.point_start[first_point]]
+    for p in range(first_point, last_point):
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], state.points[p])
+            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
+                j, k = i - first, layout.camera[i]
+                chunk.in_rig[j, 0] = x
+                chunk.in_rig[j, 1] = y
+                chunk.in_rig[j, 2] = z
+                chunk.bucket[k, chunk.counts[k]] = j
+                chunk.counts[k] += 1
+    return first
+
+
+@kernel
+def _load(chunk, camera, start, count):
+    """Points in the rig of a camera's observations into lanes."""
+    for i in range(BLOCK):
+        j = chunk.bucket[camera, start + min(i, count - 1)]
+        chunk.buffer[X * STRIDE + i] = chunk.in_rig[j, 0]
+        chunk.buffer[Y * STRIDE + i] = chunk.in_rig[j, 1]
+        chunk.buffer[Z * STRIDE + i] = chunk.in_rig[j, 2]
+
+
+@kernel
+def evaluate(layout, state, first, chunk):
+    """Residuals of a gathered chunk into ``errors``."""
+    errors, buffer = chunk.errors, chunk.buffer
+    for k in range(len(chunk.counts)):
+        cam, lens, port = state.cams[k], state.lenses[k], state.ports[k]
+        for start in range(0, chunk.counts[k], BLOCK):
+            count = min(BLOCK, chunk.counts[k] - start)
+            _load(chunk, k, start, count)
+            project_from_rig(cam, lens, port, buffer)
+            for i in range(count):
+                j = chunk.bucket[k, start + i]
+                if buffer[OK * STRIDE + i] == 1.0:
+                    errors[j, 0] = buffer[PX * STRIDE + i] - layout.xy[first + j, 0]
+                    errors[j, 1] = buffer[PY * STRIDE + i] - layout.xy[first + j, 1]
+                else:
+                    x, y, z = chunk.in_rig[j]
+                    seen = layout.xy[first + j]
+                    _, rx, ry = residual(x, y, z, seen, cam, lens, port)
+                    errors[j, 0], errors[j, 1] = rx, ry
+
+
+@kernel
+def _columns(layout, k):
+    """Columns of the Jacobian of a camera: the residual, then what is free."""
+    slots = layout.free_slot[layout.free_start[k] : layout.free_start[k + 1]]
+    columns = np.empty(len(slots) + 1, dtype=np.int64)
+    columns[0] = RESIDUAL
+    for s in range(len(slots)):
+        columns[s + 1] = COLUMN_OF_SLOT[slots[s]]
+    return columns
+
+
+@kernel
+def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
+    """Products of residuals and Jacobians of a gathered chunk into ``rows``.
+
+    Args:
+        sums: (C, W, W + 1), added to: each camera against the residual and itself.
+    """
+    buffer, products = chunk.buffer, chunk.products
+    for k in range(len(chunk.counts)):
+        columns = _columns(layout, k)
+        for start in range(0, chunk.counts[k], BLOCK):
+            count = min(BLOCK, chunk.counts[k] - start)
+            _load(chunk, k, start, count)
+            project_from_rig(state.cams[k], state.lenses[k], state.ports[k], buffer)
+            jac_from_rig(state.cams[k], state.arms[k], state.ports[k], buffer)
+            if layout.free_lens:
+                lens_columns(state.lenses[k], count, chunk.j_lens, buffer)
+            _residuals(layout, state, first, k, start, count, chunk)
+            weigh(count, loss, scale, buffer, products)
+            multiply_cells(buffer, products)
+            multiply_camera(columns, sums[k], buffer, products)
+            for i in range(count):
+                j = chunk.bucket[k, start + i]
+                for a in range(COUPLING + 3 * len(columns) - 3):
+                    chunk.rows[j, a] = products[(CELL + a) * STRIDE + i]
+
+
+@kernel
+def _residuals(layout, state, first, k, start, count, chunk):
+    """RES_U and RES_V; lanes that are not OK once more, by the scalar kernels."""
+    buffer = chunk.buffer
+    for i in range(BLOCK):
+        j = chunk.bucket[k, start + min(i, count - 1)]
+        rx = buffer[PX * STRIDE + i] - layout.xy[first + j, 0]
+        ry = buffer[PY * STRIDE + i] - layout.xy[first + j, 1]
+        if buffer[OK * STRIDE + i] != 1.0:
+            x, y, z = chunk.in_rig[j]
+            _, rx, ry = redo_lane(
+                i,
+                x,
+                y,
+                z,
+                layout.xy[first + j],
+                state.cams[k],
+                state.arms[k],
+                state.lenses[k],
+                state.ports[k],
+                layout.free_lens,
+                chunk.scalar,
+                buffer,
+            )
+        buffer[RES_U * STRIDE + i], buffer[RES_V * STRIDE + i] = rx, ry
+
+
+@kernel
+def cost_of_errors(errors, count, loss, scale):
+    """(0.5 sum rho(|e|^2), number of valid errors) of the first ones.
+
+    Cauchy's logarithms are taken of products: log(1 + s) + log(1 + t) is
+    log1p(s + t + s t), which keeps the digits of small s and t.
+    """
+    valid, total, product, c2 = 0, 0.0, 0.0, scale * scale
+    for j in range(count):
+        square = errors[j, 0] * errors[j, 0] + errors[j, 1] * errors[j, 1]
+        if square < math.inf:
+            valid += 1
+        else:
+            square = INVALID_PX * INVALID_PX
+        if loss == CAUCHY:
+            ratio = square / c2
+            product += ratio + ratio * product
+            if product > 1e100:  # a factor of 1e200 still fits
+                total += c2 * math.log1p(product)
+                product = 0.0
+        else:
+            total += square
+    return 0.5 * (total + c2 * math.log1p(product)), valid
