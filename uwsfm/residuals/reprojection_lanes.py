@@ -91,13 +91,13 @@ def _rig_columns(cam, arm, row, buffer):
 
 
 @kernel
-def lens_columns(lens, count, j_lens, buffer):
-    """Columns by the lens parameters of the first lanes: their rays in air are known.
+def lens_columns(lens, j_lens, buffer):
+    """Columns by the lens parameters: the rays in air are known.
 
     Args:
         j_lens: (2, 12) scratch.
     """
-    for i in range(count):
+    for i in range(BLOCK):
         inv_z = 1.0 / buffer[VZ * STRIDE + i]
         u, v = buffer[VX * STRIDE + i] * inv_z, buffer[VY * STRIDE + i] * inv_z
         jac_by_params(u, v, lens, j_lens)

@@ -182,7 +182,7 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
             project_from_rig(state.cams[k], state.lenses[k], state.ports[k], buffer)
             jac_from_rig(state.cams[k], state.arms[k], state.ports[k], buffer)
             if layout.free_lens:
-                lens_columns(state.lenses[k], count, chunk.j_lens, buffer)
+                lens_columns(state.lenses[k], chunk.j_lens, buffer)
             _residuals(layout, state, first, k, start, count, chunk)
             weigh(count, loss, scale, buffer, products)
             multiply_cells(buffer, products)

@@ -9,7 +9,7 @@ the rig, the pose enters by M = [-[q]x, I] and the point by the frame's rotation
 The reduced system is dense: all frames, then the border (rig, ports, lenses).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
+from uwsfm.scene import IndexArray
 from uwsfm.solver.assembly import add_cell, assemble, new_sums, rotation, scatter
 from uwsfm.solver.cells import (
     add_point_3d,
@@ -35,8 +36,14 @@ from uwsfm.solver.chunks import (
 from uwsfm.solver.error_models import POINT_3D, REPROJECTION, ErrorModel
 from uwsfm.solver.layout import Layout
 from uwsfm.solver.state import KernelState
+from uwsfm.solver.threads import chunk_bounds, run_chunks
 
 MIN_DIAGONAL = 1e-6
+
+PART = 20_000
+"""Observations that are worth a thread: two milliseconds."""
+MAX_PARTS = 16
+"""Each needs sums of its own, 6 (7 + B) numbers per frame."""
 
 
 class NormalEquations(NamedTuple):
@@ -153,6 +160,16 @@ def _linearize_in_space(layout, state, error, loss, scale, out):
     scatter_blocks(layout, work, out)
 
 
+def _parts(layout: Layout) -> IndexArray:
+    """Bounds of the points' parts, for threads.
+
+    They depend on the problem alone, and parts are summed in their order: results are
+    the same for any number of threads.
+    """
+    count = min(MAX_PARTS, 1 + len(layout.xy) // PART)
+    return chunk_bounds(layout.cell_start[layout.point_start], count)
+
+
 @kernel
 def _linearize_points(layout, state, loss, scale, begin, end, out):
     """Reprojection errors of points begin to end: their blocks, and `Sums`."""
@@ -179,10 +196,16 @@ def linearize(
     if error.code != REPROJECTION:
         _linearize_in_space(layout, state, error, loss, scale, out)
         return
-    sums = _linearize_points(
-        layout, state, loss, scale, 0, len(layout.point_start) - 1, out
-    )
-    scatter(layout, sums, out)
+    bounds = _parts(layout)
+    sums: list[Any] = [None] * (len(bounds) - 1)
+
+    def add_part(part: int) -> None:
+        begin, end = bounds[part], bounds[part + 1]
+        sums[part] = _linearize_points(layout, state, loss, scale, begin, end, out)
+
+    run_chunks(add_part, len(sums))
+    for part in sums:
+        scatter(layout, part, out)
 
 
 @kernel
@@ -221,7 +244,15 @@ def total_cost(
     """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
     if error.code != REPROJECTION:
         return _cost_in_space(layout, state, error, loss, scale)
-    return _cost_of_points(layout, state, loss, scale, 0, len(layout.point_start) - 1)
+    bounds = _parts(layout)
+    costs = [(0.0, 0)] * (len(bounds) - 1)
+
+    def add_part(part: int) -> None:
+        begin, end = bounds[part], bounds[part + 1]
+        costs[part] = _cost_of_points(layout, state, loss, scale, begin, end)
+
+    run_chunks(add_part, len(costs))
+    return sum(cost for cost, _ in costs), sum(valid for _, valid in costs)
 
 
 @kernel
