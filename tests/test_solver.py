@@ -11,7 +11,7 @@ from uwsfm import CalibrateOptions, InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.residuals.border import BORDER_SIZE, LENGTH
 from uwsfm.simulate import Perturbation, perturbed
-from uwsfm.solver import assembly, normal_equations, schur
+from uwsfm.solver import assembly, chunks, normal_equations, schur
 from uwsfm.solver import levenberg_marquardt as lm
 from uwsfm.solver.error_models import error_model
 from uwsfm.solver.layout import HELD, build_layout
@@ -247,9 +247,10 @@ def test_compiled_kernels_equal_their_python():
     fast = normal_equations.empty_normal_equations(layout)
     slow = normal_equations.empty_normal_equations(layout)
     normal_equations.linearize(layout, state, error, 1, 3.0, fast)
+    chunk, sums = chunks.new_chunk(layout), assembly.new_sums(layout)
     linearize_points = python_of(normal_equations._linearize_points)
-    sums = linearize_points(layout, state, 1, 3.0, 0, len(state.points), slow)
-    python_of(assembly.scatter)(layout, sums, slow)
+    linearize_points(layout, state, 1, 3.0, 0, len(state.points), chunk, sums, slow)
+    normal_equations.scatter(layout, sums, slow)
     for a, b in zip(fast, slow, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(a).max())
     size = layout.num_frame_cols + layout.num_border_cols

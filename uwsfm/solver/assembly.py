@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import fused, kernel, lane
+from uwsfm._jit import fused, lane
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.chunks import COUPLING, GRAD, width
+from uwsfm.solver.layout import Layout
 
 
 class Sums(NamedTuple):
@@ -24,17 +25,16 @@ class Sums(NamedTuple):
     """(C W, 3) scratch: one point against the cameras."""
 
 
-@kernel
-def new_sums(layout):
+def new_sums(layout: Layout) -> Sums:
     """Zeroed sums of the sizes of a layout."""
     num_cameras, num_frames = len(layout.free_start) - 1, len(layout.frame_col)
     w = width(layout)
     return Sums(
-        np.zeros((num_frames, 6, 6)),
-        np.zeros((num_frames, 6)),
-        np.zeros((num_frames, num_cameras * w, 6)),
-        np.zeros((num_cameras, w, w + 1)),
-        np.zeros((num_cameras * w, 3)),
+        frames=np.zeros((num_frames, 6, 6)),
+        frames_grad=np.zeros((num_frames, 6)),
+        frames_border=np.zeros((num_frames, num_cameras * w, 6)),
+        blocks=np.zeros((num_cameras, w, w + 1)),
+        of_point=np.zeros((num_cameras * w, 3)),
     )
 
 
@@ -81,7 +81,7 @@ def rotation(frames, f):
     )
 
 
-@lane
+@fused
 def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
     """Row a of M^T H: times M it belongs to the frame, times R to the coupling."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
@@ -162,7 +162,9 @@ def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
     """Add the rows of an evaluated chunk to the blocks of its points and the sums."""
     rows, in_rig, w = chunk.rows, chunk.in_rig, sums.blocks.shape[1]
     for p in range(first_point, last_point):
-        sums.of_point[:] = 0.0
+        for k in range(len(sums.of_point)):
+            for a in range(3):
+                sums.of_point[k, a] = 0.0
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             start, end = layout.cell_start[c] - first, layout.cell_start[c + 1] - first
             f = layout.cell_frame[c]
@@ -180,24 +182,3 @@ def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
                 col = layout.free_col[at + s]
                 for a in range(3):
                     out.points_border[p, a, col] += sums.of_point[k * w + s, a]
-
-
-@kernel
-def scatter(layout, sums, out):
-    """Add sums to the normal equations, where cameras may share border columns."""
-    w = sums.blocks.shape[1]
-    out.frames[:] += sums.frames
-    out.frames_grad[:] += sums.frames_grad
-    for k in range(len(layout.free_start) - 1):
-        at = layout.free_start[k]
-        for s in range(layout.free_start[k + 1] - at):
-            col = layout.free_col[at + s]
-            out.border_grad[col] += sums.blocks[k, s, 0]
-            for f in range(len(layout.frame_col)):
-                for a in range(6):
-                    out.frames_border[f, a, col] += sums.frames_border[f, k * w + s, a]
-            for t in range(s + 1):
-                other = layout.free_col[at + t]
-                out.border[col, other] += sums.blocks[k, s, t + 1]
-                if t < s:
-                    out.border[other, col] += sums.blocks[k, s, t + 1]

@@ -33,6 +33,7 @@ from uwsfm.solver.lane_products import (
     multiply_cells,
     weigh,
 )
+from uwsfm.solver.layout import Layout
 from uwsfm.solver.losses import CAUCHY, INVALID_PX
 
 CHUNK: Final = 512
@@ -57,40 +58,55 @@ class Chunk(NamedTuple):
     """(C, M) the observations of each camera, counted from the chunk's first."""
     counts: IndexArray
     """(C,) how many there are."""
+    columns: IndexArray
+    """(C, W + 1)"""
     buffer: Array
     """Lanes, see `uwsfm.models.lanes`."""
     products: Array
     """Lanes, see `uwsfm.solver.lane_products`."""
     j_lens: Array
-    scalar: tuple[Array, Array, Array]
+    j_port: Array
+    j_rig: Array
+    j_border: Array
     """Scratch of the scalar kernels."""
 
 
-@kernel
-def width(layout):
+def width(layout: Layout) -> int:
     """W: the most columns that are free of one camera."""
-    return np.diff(layout.free_start).max()
+    return int(np.diff(layout.free_start).max())
 
 
-@kernel
-def new_chunk(layout):
+def new_chunk(layout: Layout) -> Chunk:
     """Scratch that the largest chunk of a layout fits in."""
-    num_cameras, largest = len(layout.free_start) - 1, CHUNK
-    for p in range(len(layout.point_start) - 1):
-        first, last = layout.point_start[p], layout.point_start[p + 1]
-        largest = max(largest, layout.cell_start[last] - layout.cell_start[first])
+    num_cameras = len(layout.free_start) - 1
+    # One point may have more observations than a chunk should.
+    of_points = np.diff(layout.cell_start[layout.point_start])
+    largest = max(CHUNK, int(of_points.max()))
     columns = COUPLING + 3 * width(layout)
     return Chunk(
-        np.zeros((largest, columns)),
-        np.empty((largest, 2)),
-        np.empty((largest, 3)),
-        np.empty((num_cameras, largest), dtype=np.int64),
-        np.empty(num_cameras, dtype=np.int64),
-        np.empty(SIZE),
-        np.empty((CELL + columns) * STRIDE),
-        np.empty((2, NUM_PARAMS)),
-        (np.empty((2, JAC_SIZE)), np.empty((2, 3)), np.zeros((2, BORDER_SIZE))),
+        rows=np.zeros((largest, columns)),
+        errors=np.empty((largest, 2)),
+        in_rig=np.empty((largest, 3)),
+        bucket=np.empty((num_cameras, largest), dtype=np.int64),
+        counts=np.empty(num_cameras, dtype=np.int64),
+        columns=_columns(layout),
+        buffer=np.empty(SIZE),
+        products=np.empty((CELL + columns) * STRIDE),
+        j_lens=np.empty((2, NUM_PARAMS)),
+        j_port=np.empty((2, JAC_SIZE)),
+        j_rig=np.empty((2, 3)),
+        j_border=np.zeros((2, BORDER_SIZE)),
     )
+
+
+def _columns(layout: Layout) -> IndexArray:
+    """(C, W + 1): lanes' columns of the residual and a camera's parameters."""
+    num_cameras = len(layout.free_start) - 1
+    columns = np.full((num_cameras, width(layout) + 1), RESIDUAL)
+    for k in range(num_cameras):
+        slots = layout.free_slot[layout.free_start[k] : layout.free_start[k + 1]]
+        columns[k, 1 : len(slots) + 1] = COLUMN_OF_SLOT[slots]
+    return columns
 
 
 @kernel
@@ -108,7 +124,8 @@ def chunk_end(layout, p, end):
 @kernel
 def gather(layout, state, first_point, last_point, chunk):
     """Move the points to the rig and list the observations of each camera."""
-    chunk.counts[:] = 0
+    for k in range(len(chunk.counts)):
+        chunk.counts[k] = 0
     first = layout.cell_start[layout.point_start[first_point]]
     for p in range(first_point, last_point):
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
@@ -156,17 +173,6 @@ def evaluate(layout, state, first, chunk):
 
 
 @kernel
-def _columns(layout, k):
-    """Columns of the Jacobian of a camera: the residual, then what is free."""
-    slots = layout.free_slot[layout.free_start[k] : layout.free_start[k + 1]]
-    columns = np.empty(len(slots) + 1, dtype=np.int64)
-    columns[0] = RESIDUAL
-    for s in range(len(slots)):
-        columns[s + 1] = COLUMN_OF_SLOT[slots[s]]
-    return columns
-
-
-@kernel
 def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
     """Products of residuals and Jacobians of a gathered chunk into ``rows``.
 
@@ -175,7 +181,7 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
     """
     buffer, products = chunk.buffer, chunk.products
     for k in range(len(chunk.counts)):
-        columns = _columns(layout, k)
+        num_free = layout.free_start[k + 1] - layout.free_start[k]
         for start in range(0, chunk.counts[k], BLOCK):
             count = min(BLOCK, chunk.counts[k] - start)
             _load(chunk, k, start, count)
@@ -186,10 +192,10 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
             _residuals(layout, state, first, k, start, count, chunk)
             weigh(count, loss, scale, buffer, products)
             multiply_cells(buffer, products)
-            multiply_camera(columns, sums[k], buffer, products)
+            multiply_camera(chunk.columns[k], num_free, sums[k], buffer, products)
             for i in range(count):
                 j = chunk.bucket[k, start + i]
-                for a in range(COUPLING + 3 * len(columns) - 3):
+                for a in range(COUPLING + 3 * num_free):
                     chunk.rows[j, a] = products[(CELL + a) * STRIDE + i]
 
 
@@ -214,22 +220,26 @@ def _residuals(layout, state, first, k, start, count, chunk):
                 state.lenses[k],
                 state.ports[k],
                 layout.free_lens,
-                chunk.scalar,
+                (chunk.j_port, chunk.j_rig, chunk.j_border),
                 buffer,
             )
         buffer[RES_U * STRIDE + i], buffer[RES_V * STRIDE + i] = rx, ry
 
 
 @kernel
-def cost_of_errors(errors, count, loss, scale):
-    """(0.5 sum rho(|e|^2), number of valid errors) of the first ones.
+def cost_of_errors(errors, loss, scale, squares):
+    """(0.5 sum rho(|e|^2), number of valid errors) of an evaluated chunk.
 
     Cauchy's logarithms are taken of products: log(1 + s) + log(1 + t) is
     log1p(s + t + s t), which keeps the digits of small s and t.
+
+    Args:
+        squares: (M',), written: |e|^2 in px^2, NaN where invalid.
     """
     valid, total, product, c2 = 0, 0.0, 0.0, scale * scale
-    for j in range(count):
+    for j in range(len(squares)):
         square = errors[j, 0] * errors[j, 0] + errors[j, 1] * errors[j, 1]
+        squares[j] = square
         if square < math.inf:
             valid += 1
         else:

@@ -96,15 +96,16 @@ def _couple(column, row, buffer, products):
 
 
 @fused
-def multiply_camera(columns, sums, buffer, products):
+def multiply_camera(columns, num_free, sums, buffer, products):
     """Rows of COUPLE, and the sums over lanes of a camera against itself.
 
     Args:
-        columns: (W' + 1,) of its free parameters, after RESIDUAL.
-        sums: (W', W' + 1) lower triangle, added to.
+        columns: (W + 1,) RESIDUAL, then those of its free parameters.
+        num_free: how many these are.
+        sums: (W, W + 1) lower triangle, added to.
     """
-    last = len(columns) - 1
-    for s in range(last):
+    last = num_free
+    for s in range(num_free):
         one = columns[s + 1]
         for t in range(0, s + 2, 4):  # four at a time hide the cost of adding lanes up
             t1, t2, t3 = min(t + 1, last), min(t + 2, last), min(t + 3, last)

@@ -259,8 +259,7 @@ def _iterate(
         if damping > 1e12:
             stop = Stop.STALLED
             break
-    squares = np.empty(len(problem.layout.xy))
-    squared_errors(problem.layout, state.kernel_state(), squares)
+    squares = squared_errors(problem.layout, state.kernel_state())
     return LevenbergMarquardtResult(
         state=state,
         cost=cost,

@@ -9,7 +9,7 @@ the rig, the pose enters by M = [-[q]x, I] and the point by the frame's rotation
 The reduced system is dense: all frames, then the border (rig, ports, lenses).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.scene import IndexArray
-from uwsfm.solver.assembly import add_cell, assemble, new_sums, rotation, scatter
+from uwsfm.solver.assembly import Sums, add_cell, assemble, new_sums, rotation
 from uwsfm.solver.cells import (
     add_point_3d,
     add_virtual_camera,
@@ -35,6 +35,7 @@ from uwsfm.solver.chunks import (
 )
 from uwsfm.solver.error_models import POINT_3D, REPROJECTION, ErrorModel
 from uwsfm.solver.layout import Layout
+from uwsfm.solver.losses import L2
 from uwsfm.solver.state import KernelState
 from uwsfm.solver.threads import chunk_bounds, run_chunks
 
@@ -171,9 +172,8 @@ def _parts(layout: Layout) -> IndexArray:
 
 
 @kernel
-def _linearize_points(layout, state, loss, scale, begin, end, out):
-    """Reprojection errors of points begin to end: their blocks, and `Sums`."""
-    chunk, sums = new_chunk(layout), new_sums(layout)
+def _linearize_points(layout, state, loss, scale, begin, end, chunk, sums, out):
+    """Reprojection errors of points begin to end: their blocks, and sums."""
     p = begin
     while p < end:
         last = chunk_end(layout, p, end)
@@ -181,7 +181,22 @@ def _linearize_points(layout, state, loss, scale, begin, end, out):
         evaluate_with_jac(layout, state, first, loss, scale, sums.blocks, chunk)
         assemble(layout, state, p, last, first, chunk, sums, out)
         p = last
-    return sums
+
+
+def scatter(layout: Layout, sums: Sums, out: NormalEquations) -> None:
+    """Add sums to the normal equations, where cameras may share border columns."""
+    out.frames[:] += sums.frames
+    out.frames_grad[:] += sums.frames_grad
+    w = sums.blocks.shape[1]
+    for k in range(len(layout.free_start) - 1):
+        cols = layout.free_col[layout.free_start[k] : layout.free_start[k + 1]]
+        block = sums.blocks[k, : len(cols), 1 : len(cols) + 1]
+        lower = np.tril(block)
+        # fx and fy of one camera may share a column.
+        np.add.at(out.border, np.ix_(cols, cols), lower + np.tril(lower, -1).T)
+        np.add.at(out.border_grad, cols, sums.blocks[k, : len(cols), 0])
+        for s, col in enumerate(cols):
+            out.frames_border[:, :, col] += sums.frames_border[:, k * w + s]
 
 
 def linearize(
@@ -197,15 +212,17 @@ def linearize(
         _linearize_in_space(layout, state, error, loss, scale, out)
         return
     bounds = _parts(layout)
-    sums: list[Any] = [None] * (len(bounds) - 1)
+    sums = [new_sums(layout) for _ in bounds[1:]]
 
     def add_part(part: int) -> None:
-        begin, end = bounds[part], bounds[part + 1]
-        sums[part] = _linearize_points(layout, state, loss, scale, begin, end, out)
+        begin, end, chunk = bounds[part], bounds[part + 1], new_chunk(layout)
+        _linearize_points(
+            layout, state, loss, scale, begin, end, chunk, sums[part], out
+        )
 
     run_chunks(add_part, len(sums))
-    for part in sums:
-        scatter(layout, part, out)
+    for part_sums in sums:
+        scatter(layout, part_sums, out)
 
 
 @kernel
@@ -222,20 +239,36 @@ def _cost_in_space(layout, state, error, loss, scale):
 
 
 @kernel
-def _cost_of_points(layout, state, loss, scale, begin, end):
+def _cost_of_points(layout, state, loss, scale, begin, end, chunk, squares):
     """Cost and number of valid reprojection errors of points begin to end."""
-    chunk = new_chunk(layout)
     cost, valid, p = 0.0, 0, begin
     while p < end:
         last = chunk_end(layout, p, end)
         first = gather(layout, state, p, last, chunk)
-        count = layout.cell_start[layout.point_start[last]] - first
         evaluate(layout, state, first, chunk)
-        part, good = cost_of_errors(chunk.errors, count, loss, scale)
+        after = layout.cell_start[layout.point_start[last]]
+        part, good = cost_of_errors(chunk.errors, loss, scale, squares[first:after])
         cost += part
         valid += good
         p = last
     return cost, valid
+
+
+def _image_cost(
+    layout: Layout, state: KernelState, loss: int, scale: float
+) -> tuple[float, int, Array]:
+    """Cost, number of valid errors and squared errors of the reprojection error."""
+    bounds, squares = _parts(layout), np.empty(len(layout.xy))
+    costs = [(0.0, 0)] * (len(bounds) - 1)
+
+    def add_part(part: int) -> None:
+        begin, end, chunk = bounds[part], bounds[part + 1], new_chunk(layout)
+        costs[part] = _cost_of_points(
+            layout, state, loss, scale, begin, end, chunk, squares
+        )
+
+    run_chunks(add_part, len(costs))
+    return sum(cost for cost, _ in costs), sum(valid for _, valid in costs), squares
 
 
 def total_cost(
@@ -244,27 +277,10 @@ def total_cost(
     """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
     if error.code != REPROJECTION:
         return _cost_in_space(layout, state, error, loss, scale)
-    bounds = _parts(layout)
-    costs = [(0.0, 0)] * (len(bounds) - 1)
-
-    def add_part(part: int) -> None:
-        begin, end = bounds[part], bounds[part + 1]
-        costs[part] = _cost_of_points(layout, state, loss, scale, begin, end)
-
-    run_chunks(add_part, len(costs))
-    return sum(cost for cost, _ in costs), sum(valid for _, valid in costs)
+    cost, valid, _ = _image_cost(layout, state, loss, scale)
+    return cost, valid
 
 
-@kernel
-def squared_errors(layout, state, squares):
+def squared_errors(layout: Layout, state: KernelState) -> Array:
     """Squared reprojection errors (N,) in sorted order, px^2; NaN where invalid."""
-    chunk = new_chunk(layout)
-    p, end = 0, len(layout.point_start) - 1
-    while p < end:
-        last = chunk_end(layout, p, end)
-        first = gather(layout, state, p, last, chunk)
-        evaluate(layout, state, first, chunk)
-        for j in range(layout.cell_start[layout.point_start[last]] - first):
-            rx, ry = chunk.errors[j, 0], chunk.errors[j, 1]
-            squares[first + j] = rx * rx + ry * ry
-        p = last
+    return _image_cost(layout, state, L2, 1.0)[2]
