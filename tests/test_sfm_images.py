@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from uwsfm.errors import InputError
-from uwsfm.sfm.images import check_images, check_masks, find_frames, natural_key
+from uwsfm.sfm.features import extract_features
+from uwsfm.sfm.image_features import find_features
+from uwsfm.sfm.images import check_masks, find_frames, natural_key
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
 from uwsfm.simulate.rigs import sample_rig
 
@@ -27,6 +29,11 @@ def image_dir(tmp_path, rng):
     return tmp_path
 
 
+def features_of(image_dir, rig) -> None:
+    frames = find_frames(image_dir, rig)
+    extract_features(frames, rig, image_dir / "work" / "f.db", FeatureOptions())
+
+
 def sentence(error: pytest.ExceptionInfo) -> str:
     text = str(error.value)
     assert "\n" not in text
@@ -38,7 +45,6 @@ def test_frames_are_equal_names_in_natural_order(image_dir, rig):
     assert frames.names == ("frame1.png", "frame2.png", "frame10.png")
     assert frames.image_name(1, 2) == "right/frame10.png"
     assert frames.warnings() == []
-    check_images(frames, rig)
 
 
 def test_natural_key_sorts_numbers_as_numbers():
@@ -118,14 +124,14 @@ def test_white_space_in_a_name_is_refused(image_dir, rig):
 def test_image_that_cannot_be_decoded_is_named(image_dir, rig, content):
     (image_dir / "right" / "frame2.png").write_bytes(content)
     with pytest.raises(InputError, match=r"right.frame2.png cannot be read"):
-        check_images(find_frames(image_dir, rig), rig)
+        features_of(image_dir, rig)
 
 
 def test_image_of_another_size_is_named_with_both_sizes(image_dir, rig):
     path = image_dir / "left" / "frame10.png"
     cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH // 2), dtype=np.uint8))
     with pytest.raises(InputError, match=r"left.frame10.png has 40 x 60 .* 80 x 60"):
-        check_images(find_frames(image_dir, rig), rig)
+        features_of(image_dir, rig)
 
 
 def test_options_refuse_what_they_cannot_do(tmp_path):
@@ -150,3 +156,23 @@ def test_masks_are_named_when_they_do_not_fit(image_dir, rig, tmp_path):
     (masks / "right" / "frame2.png.png").write_text("no image")
     with pytest.raises(InputError, match="frame2.png.png cannot be read"):
         check_masks(frames, rig, masks)
+
+
+def test_colours_and_grey_values_come_from_one_look_at_an_image(tmp_path, rng):
+    """Dots on a dark ground: the colour beneath each keypoint is its dot's."""
+    image = np.full((120, 160, 3), 20, dtype=np.uint8)
+    places = [(x, y) for x in range(20, 150, 24) for y in range(20, 110, 24)]
+    dots = [(x, y, rng.integers(90, 255, 3)) for x, y in places]
+    for x, y, color in dots:
+        cv2.circle(image, (x, y), 5, [int(v) for v in color], -1)
+    cv2.imwrite(str(tmp_path / "dots.png"), image)
+    (found,) = find_features(
+        tmp_path, ["dots.png"], (160, 120), FeatureOptions(), tmp_path, lambda: None
+    )
+    centers = np.array([(x + 0.5, y + 0.5) for x, y, _ in dots])
+    distance = np.linalg.norm(found.keypoints[:, None, :2] - centers, axis=2)
+    near = distance.min(axis=1) < 2.0
+    assert near.sum() >= len(dots)
+    expected = np.array([color[::-1] for _, _, color in dots])[distance.argmin(axis=1)]
+    np.testing.assert_array_equal(found.colors[near], expected[near])
+    assert [path.name for path in tmp_path.iterdir()] == ["dots.png"]

@@ -40,7 +40,7 @@ from uwsfm.known_lengths import KnownLengths
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
-from uwsfm.sfm.colors import point_colors
+from uwsfm.sfm.colors import stored_point_colors
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.options import (
     FeatureOptions,
@@ -55,6 +55,7 @@ from uwsfm.sfm.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
+from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL
 
 WORK = "uwsfm-work"
@@ -179,7 +180,7 @@ class _Job:
         refined = self._refined(start, arrays)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
-        model = _model(self.rig, self.images, arrays, refined, self.progress)
+        model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
         export_housing(model.rig, out / HOUSING, refined.calibration)
         export_points(model, out / POINTS, refined.calibration)
@@ -291,21 +292,20 @@ def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:
     )
 
 
-def _model(
-    rig: Rig, images: Path, arrays: StartArrays, refined: Refined, progress: Progress
-) -> Model:
-    scene = refined.scene
-    paths = [
-        [images / camera.images / name for name in arrays.frame_names]
+def _model(rig: Rig, arrays: StartArrays, refined: Refined, work_dir: Path) -> Model:
+    scene, keypoint_idx = refined.scene, arrays.keypoint_idx[refined.kept]
+    names = [
+        [f"{camera.images}/{name}" for name in arrays.frame_names]
         for camera in rig.cameras
     ]
+    colors_dir = Workspace(work_dir=work_dir).colors
     return Model(
         rig=refined_rig(rig, scene),
         scene=scene,
         frame_names=arrays.frame_names,
         keypoints=arrays.keypoints,
-        keypoint_idx=arrays.keypoint_idx[refined.kept],
-        colors=point_colors(scene, paths, progress),
+        keypoint_idx=keypoint_idx,
+        colors=stored_point_colors(scene, keypoint_idx, names, colors_dir),
     )
 
 

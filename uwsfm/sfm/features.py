@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from functools import partial
 from pathlib import Path
 
-import cv2
 import pycolmap
 
-from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
-from uwsfm.errors import InputError, UwsfmError
+from uwsfm.errors import UwsfmError
 from uwsfm.rig import Rig
-from uwsfm.sfm.background import opened, run_with_database
-from uwsfm.sfm.images import Frames, read_gray
-from uwsfm.sfm.options import FeatureOptions
+from uwsfm.sfm import background
+from uwsfm.sfm.background import opened, quiet_colmap
+from uwsfm.sfm.colors import write_colors
+from uwsfm.sfm.image_features import ImageFeatures, find_features
+from uwsfm.sfm.images import Frames
+from uwsfm.sfm.options import FeatureOptions, thread_count
 
-ENHANCED = "clahe"  # folder of the enhanced copies, beside the database
+CHUNK = 4
+"""Images of one job: an interrupted run loses no more for each thread."""
+COLORS = "colors"  # folder of the keypoints' colours, beside the database
 
 
 def extract_features(
@@ -29,69 +38,141 @@ def extract_features(
 ) -> None:
     """Write keypoints and descriptors; images that have them already are skipped.
 
+    The colours beneath the keypoints go beside the database, see `uwsfm.sfm.colors`.
+
     Args:
         frames: The images.
         rig: Gives each folder its image size.
         database_path: Created, or continued.
         options: How.
-        num_threads: -1 for all cores.
+        num_threads: -1 for all cores. The result does not depend on it.
         progress: Called with the step "features".
 
     Raises:
-        InputError: COLMAP cannot read an image; names it.
+        InputError: An image cannot be read, or has another size; names it.
+        UwsfmError: No image has a feature.
     """
-    extract_images(frames, rig, database_path, options, num_threads, progress)
-    check_complete(frames, database_path)
+    database_path.parent.mkdir(parents=True, exist_ok=True)
+    colors_dir = database_path.parent / COLORS
+    extract_images(
+        frames, rig, database_path, colors_dir, options, num_threads, progress
+    )
+    require_features(frames, database_path)
 
 
 def extract_images(
     frames: Frames,
     rig: Rig,
     database_path: Path,
+    colors_dir: Path,
     options: FeatureOptions,
     num_threads: int = -1,
     progress: Progress = silent,
 ) -> None:
-    """`extract_features` of some frames; images that COLMAP cannot read are missing."""
-    image_dir = frames.image_dir
-    if options.clahe:
-        image_dir = database_path.parent / ENHANCED
-        write_enhanced(frames, image_dir, progress)
-    database_path.parent.mkdir(parents=True, exist_ok=True)
+    """`extract_features` of some frames, which may have none."""
+    threads = thread_count(num_threads)
     total = len(frames.folders) * len(frames.names)
-    for c, rig_camera in enumerate(rig.cameras):
-        names = [frames.image_name(c, f) for f in range(len(frames.names))]
-        extraction = _extraction_options(rig_camera.camera, options, num_threads)
+    sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
+    stopped = threading.Event()
 
-        def extract(
-            token: pycolmap.CancellationToken,
-            names: list[str] = names,
-            extraction: pycolmap.FeatureExtractionOptions = extraction,
-        ) -> None:
-            pycolmap.extract_features(
-                database_path,
-                image_dir,
-                image_names=names,
-                camera_mode=pycolmap.CameraMode.PER_FOLDER,
-                reader_options=_reader_options(options),
-                extraction_options=extraction,
-                device=pycolmap.Device.cpu,
-                cancellation_token=token,
-            )
+    def watch() -> None:
+        if stopped.is_set():
+            raise InterruptedError
 
-        run_with_database(
-            database_path,
-            extract,
-            lambda database: progress("features", database.num_images(), total),
-        )
+    def found(names: list[str]) -> list[ImageFeatures]:
+        size = sizes[names[0].rpartition("/")[0]]
+        work_dir = database_path.parent
+        return find_features(frames.image_dir, names, size, options, work_dir, watch)
+
+    with opened(database_path) as database, quiet_colmap():
+        cameras = _cameras(database, frames, rig)
+        chunks = _missing(database, frames)
+        done = total - sum(map(len, chunks))
+        with ThreadPoolExecutor(threads) as pool:
+            try:
+                # In order, so that the database is the same for any threads.
+                jobs = deque(pool.submit(found, names) for names in chunks)
+                for names in chunks:
+                    report = partial(progress, "features", done, total)
+                    features = _awaited(jobs.popleft(), report)
+                    for name, each in zip(names, features, strict=True):
+                        write_colors(colors_dir, name, each.colors)
+                        camera_id = cameras[name.rpartition("/")[0]]
+                        _write_image(database, name, camera_id, each)
+                    done += len(names)
+                    progress("features", done, total)
+            finally:
+                stopped.set()
     progress("features", total, total)
 
 
-def _reader_options(options: FeatureOptions) -> pycolmap.ImageReaderOptions:
-    reader = pycolmap.ImageReaderOptions()
-    if options.mask_dir is not None:
-        reader.mask_path = options.mask_dir
-    return reader
+def _awaited(
+    job: Future[list[ImageFeatures]], watch: Callable[[], None]
+) -> list[ImageFeatures]:
+    while True:
+        try:
+            return job.result(timeout=background.POLL_SECONDS)
+        except StillRunning:
+            if job.done():
+                raise
+            watch()
+
+
+def _cameras(database: pycolmap.Database, frames: Frames, rig: Rig) -> dict[str, int]:
+    """The camera of each folder, from an earlier run if there was one."""
+    found = {
+        image.name.rpartition("/")[0]: image.camera_id
+        for image in database.read_all_images()
+    }
+    for folder in frames.folders:
+        if folder not in found:
+            (lens,) = (c.camera for c in rig.cameras if c.images == folder)
+            found[folder] = database.write_camera(_in_air(lens))
+    return found
+
+
+def _in_air(lens: pycolmap.Camera, camera_id: int | None = None) -> pycolmap.Camera:
+    camera = pycolmap.Camera(
+        model=lens.model_name,
+        width=lens.width,
+        height=lens.height,
+        params=lens.params,
+        has_prior_focal_length=True,
+    )
+    if camera_id is not None:
+        camera.camera_id = camera_id
+    return camera
+
+
+def _missing(database: pycolmap.Database, frames: Frames) -> list[list[str]]:
+    """Chunks of images without features, each of one folder, along the dive."""
+    there = {
+        image.name
+        for image in database.read_all_images()
+        if database.exists_descriptors(image.image_id)
+    }
+    chunks = []
+    for begin in range(0, len(frames.names), CHUNK):
+        for c in range(len(frames.folders)):
+            block = range(begin, min(begin + CHUNK, len(frames.names)))
+            names = [frames.image_name(c, f) for f in block]
+            chunks.append([name for name in names if name not in there])
+    return [names for names in chunks if names]
+
+
+def _write_image(
+    database: pycolmap.Database, name: str, camera_id: int, features: ImageFeatures
+) -> None:
+    """All of an image or nothing: a process may be killed at any point."""
+    with pycolmap.DatabaseTransaction(database):
+        image_id = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+        database.write_keypoints(image_id, features.keypoints)
+        database.write_descriptors(
+            image_id,
+            pycolmap.FeatureDescriptors(
+                pycolmap.FeatureExtractorType.SIFT, features.descriptors
+            ),
+        )
 
 
 def store_intrinsics(frames: Frames, rig: Rig, database_path: Path) -> None:
@@ -106,71 +187,18 @@ def store_intrinsics(frames: Frames, rig: Rig, database_path: Path) -> None:
             for image in database.read_all_images()
         }
         for camera_id, folder in folder_of.items():
-            lens = lens_of[folder]
-            database.update_camera(
-                pycolmap.Camera(
-                    camera_id=camera_id,
-                    model=lens.model_name,
-                    width=lens.width,
-                    height=lens.height,
-                    params=lens.params,
-                    has_prior_focal_length=True,
-                )
-            )
+            database.update_camera(_in_air(lens_of[folder], camera_id))
 
 
-def _extraction_options(
-    camera: pycolmap.Camera, options: FeatureOptions, num_threads: int
-) -> pycolmap.FeatureExtractionOptions:
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
-    extraction.num_threads = num_threads
-    extraction.max_image_size = options.max_image_size
-    small = camera.width * camera.height <= options.max_upsampled_px
-    extraction.sift.first_octave = -1 if small else 0
-    extraction.sift.peak_threshold = options.peak_threshold
-    extraction.sift.max_num_features = options.max_num_features
-    # A second orientation is the same position again: no second measurement.
-    extraction.sift.max_num_orientations = 1
-    return extraction
+def require_features(frames: Frames, database_path: Path) -> None:
+    """Refuse blank images.
 
-
-def check_complete(frames: Frames, database_path: Path) -> None:
-    """Every image must be in the database: COLMAP only logs those it cannot read."""
+    Raises:
+        UwsfmError: no image has a feature.
+    """
     with opened(database_path) as database:
-        images = {image.name: image.image_id for image in database.read_all_images()}
-        for name in frames.image_names():
-            if name not in images or not database.exists_keypoints(images[name]):
-                raise InputError(
-                    f"COLMAP cannot read image {frames.image_dir / name}: convert it "
-                    "to 8-bit PNG or JPEG"
-                )
         if database.num_keypoints() == 0:
             raise UwsfmError(
                 f"no features were found in the images of {frames.image_dir}: "
                 "are they blank?"
             )
-
-
-def write_enhanced(
-    frames: Frames, output_dir: Path, progress: Progress = silent
-) -> None:
-    """Grey copies of the images with their contrast equalised locally (CLAHE).
-
-    Copies that exist are kept; every copy is written whole or not at all.
-    """
-    equalizer = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))
-    names = list(frames.image_names())
-    for done, name in enumerate(names, start=1):
-        target = output_dir / name
-        if not target.exists():
-            gray = read_gray(frames.image_dir / name)
-            if gray is None:
-                raise InputError(f"image {frames.image_dir / name} cannot be read")
-            with replaced_file(target) as partial:
-                quality = []
-                if target.suffix.lower() in (".jpg", ".jpeg"):
-                    quality = [cv2.IMWRITE_JPEG_QUALITY, 98]
-                if not cv2.imwrite(str(partial), equalizer.apply(gray), quality):
-                    raise UwsfmError(f"the enhanced image {target} cannot be written")
-        progress("enhancing images", done, len(names))

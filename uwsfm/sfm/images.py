@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.rig import Rig
 
@@ -124,29 +122,6 @@ def _images_of(image_dir: Path, folder: str, camera: str) -> set[str]:
     return names
 
 
-def check_images(
-    frames: Frames, rig: Rig, *, num_threads: int = 2, progress: Progress = silent
-) -> None:
-    """Decode every image once, and compare its size with its camera's.
-
-    Raises:
-        InputError: an image that cannot be decoded, or of another size; names it.
-    """
-    sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
-    names = list(frames.image_names())
-
-    def check(image_name: str) -> str | None:
-        size = sizes[image_name.rpartition("/")[0]]
-        return image_fault(frames.image_dir / image_name, size)
-
-    with ThreadPoolExecutor(max_workers=max(1, num_threads)) as pool:
-        for done, fault in enumerate(pool.map(check, names), start=1):
-            if fault is not None:
-                pool.shutdown(cancel_futures=True)
-                raise InputError(fault)
-            progress("checking images", done, len(names))
-
-
 def check_masks(frames: Frames, rig: Rig, mask_dir: Path) -> None:
     """Every image needs a mask of its size: ``<mask_dir>/left/0001.jpg.png``.
 
@@ -171,10 +146,14 @@ def check_masks(frames: Frames, rig: Rig, mask_dir: Path) -> None:
 
 def image_fault(path: Path, size: tuple[int, int]) -> str | None:
     """Why an image cannot be used by a camera of ``size`` (width, height), or None."""
-    image = read_gray(path)
+    return size_fault(path, read_gray(path), size)
+
+
+def size_fault(path: Path, image: Any, size: tuple[int, int]) -> str | None:
+    """`image_fault` of what was read from a file: rows, columns, or None."""
     if image is None:
         return f"image {path} cannot be read: it is not an image, or it is damaged"
-    height, width = image.shape
+    height, width = image.shape[:2]
     if (width, height) != size:
         return (
             f"image {path} has {width} x {height} pixels, but the intrinsics of its "
@@ -188,9 +167,17 @@ def read_gray(path: Path) -> Any:
 
     The orientation tag is ignored, as by COLMAP: intrinsics belong to the sensor.
     """
+    return _read(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_color(path: Path) -> Any:
+    """`read_gray` in blue, green and red: (height, width, 3)."""
+    return _read(path, cv2.IMREAD_COLOR)
+
+
+def _read(path: Path, flags: int) -> Any:
     try:
         data = np.fromfile(path, dtype=np.uint8)
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        return cv2.imdecode(data, flags)
+        return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except (OSError, cv2.error):  # cv2.error: an empty file
         return None

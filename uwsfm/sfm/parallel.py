@@ -20,7 +20,7 @@ from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import opened, remove_database
-from uwsfm.sfm.features import check_complete, extract_images
+from uwsfm.sfm.features import COLORS, extract_images, require_features
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks
 from uwsfm.sfm.matching import chosen_pairs
@@ -76,7 +76,7 @@ def extract_elsewhere(
     remove_database(database_path)
     with replaced_file(database_path) as partial:
         _join(partial, paths, frames)
-    check_complete(frames, database_path)
+    require_features(frames, database_path)
     shutil.rmtree(folder)
 
 
@@ -86,7 +86,8 @@ def extract_block(
     """Features of some frames in a database of their own."""
     with tempfile.TemporaryDirectory() as own:
         database_path = Path(own) / "block.db"
-        extract_images(frames, rig, database_path, options, num_threads=1)
+        colors_dir = path.parent.parent / COLORS
+        extract_images(frames, rig, database_path, colors_dir, options, num_threads=1)
         with replaced_file(path) as partial:
             shutil.copyfile(database_path, partial)
 

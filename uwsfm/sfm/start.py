@@ -20,7 +20,7 @@ from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import extract_features, store_intrinsics
 from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
-from uwsfm.sfm.images import Frames, check_images, check_masks, find_frames
+from uwsfm.sfm.images import Frames, check_masks, find_frames
 from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
@@ -165,7 +165,7 @@ def match_images(
     elsewhere = workers if workers is not None and workers.elsewhere else None
     sizes = sorted([c.images, c.camera.width, c.camera.height] for c in rig.cameras)
     inputs = [
-        [version("uwsfm"), pycolmap.__version__],
+        [version("uwsfm"), pycolmap.__version__, "colours"],
         sizes,
         frames.fingerprint(),
         asdict(options.features),
@@ -173,7 +173,6 @@ def match_images(
     ]
 
     def extract() -> None:
-        check_images(frames, rig, num_threads=options.threads, progress=progress)
         if options.features.mask_dir is not None:
             check_masks(frames, rig, options.features.mask_dir)
         if elsewhere is not None:
@@ -208,7 +207,7 @@ def match_images(
 
     def forget() -> None:
         remove_database(space.features)
-        for folder in (space.enhanced, space.work_dir / FEATURES):
+        for folder in (space.colors, space.work_dir / FEATURES):
             shutil.rmtree(folder, ignore_errors=True)
 
     def forget_matches() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from uwsfm.sfm.features import ENHANCED
+from uwsfm.sfm.features import COLORS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +20,9 @@ class Workspace:
         return self.work_dir / "database.db"
 
     @property
-    def enhanced(self) -> Path:
-        return self.work_dir / ENHANCED
+    def colors(self) -> Path:
+        """Colours beneath the keypoints."""
+        return self.work_dir / COLORS
 
     @property
     def rig(self) -> Path:
