@@ -1,0 +1,175 @@
+"""The results as Markdown."""
+
+from typing import Any
+
+from kernels import STAGES as KERNEL_STAGES
+from solver import STAGES as SOLVER_STAGES
+from targets import Results, outcomes, solved_sizes
+
+
+def markdown(results: Results) -> str:
+    parts = [_machine(results), _targets(results), _kernels(results)]
+    parts += [_solver(results), _peers(results), _demo(results)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _machine(results: Results) -> str:
+    found = results["machine"]
+    versions = ", ".join(f"{k} {v}" for k, v in found["versions"].items())
+    return (
+        f"Machine: {found['cpu']}; {found['cores']} cores, {found['memory_gb']} GB, "
+        f"{found['system']}. {versions}."
+    )
+
+
+def _targets(results: Results) -> str:
+    rows = []
+    for one in outcomes(results):
+        sign = ">=" if one.at_least else "<="
+        rows.append(
+            [
+                one.what,
+                f"{sign} {one.target:g} {one.unit}".strip(),
+                f"{one.measured:.3g} {one.unit}".strip(),
+                "yes" if one.met else "**no**",
+                f"{one.headroom:.2f}",
+                one.note,
+            ]
+        )
+    header = ["what", "target", "measured", "met", "times better than asked", "note"]
+    return "## Targets\n\n" + table(header, rows) if rows else ""
+
+
+def _kernels(results: Results) -> str:
+    if "kernels" not in results:
+        return ""
+    rows = results["kernels"]["rows"]
+    base = next(
+        row["ns"] for row in rows if (row["port"], row["lens"]) == ("flat", "PINHOLE")
+    )
+    lines = []
+    for row in rows:
+        cells = [
+            f"{row['ns'][stage]:.1f} ({row['ns'][stage] / base[stage]:.2f})"
+            if stage in row["ns"]
+            else "-"
+            for stage in KERNEL_STAGES
+        ]
+        lines.append([row["kind"], row["port"], row["lens"], *cells])
+    return (
+        "## Kernels\n\n"
+        "Nanoseconds per observation on one core, and in parentheses the ratio to the "
+        "first row. The scalar rows of the normal equations have residuals and "
+        "Jacobians but no sums; the Jacobian in numpy has the point's columns only.\n\n"
+        + table(["", "port", "lens", *KERNEL_STAGES], lines)
+        + "\n\n![kernels](kernels.png)"
+    )
+
+
+def _solver(results: Results) -> str:
+    sizes = solved_sizes(results)
+    if not sizes:
+        return ""
+    lines, speed = [], []
+    for one in sizes:
+        single, double = one["one_thread"], one["two_threads"]
+        lines.append(
+            [
+                f"{one['frames']}",
+                f"{one['points']:,}",
+                f"{one['observations']:,}",
+                f"{single['iterations']}",
+                f"{1e3 * single['cpu_s']:.1f}",
+                f"{single['cpu_us_per_observation']:.3f}",
+                *(f"{1e3 * single['stages_cpu_s'][s]:.1f}" for s in SOLVER_STAGES),
+                f"{one['peak_mb']:.0f} ({one['peak_before_mb']:.0f})",
+            ]
+        )
+        ratios = [
+            single["stages_wall_s"][s] / double["stages_wall_s"][s]
+            for s in SOLVER_STAGES
+        ]
+        whole = single["wall_s"] / double["wall_s"]
+        speed.append([f"{one['frames']}", *(f"{r:.2f}" for r in (whole, *ratios))])
+    header = ["frames", "points", "observations", "iterations", "ms", "us/observation"]
+    said = sorted({line for one in sizes for line in one["log"]})
+    return "\n\n".join(
+        [
+            "## Solver",
+            "One iteration on one core: CPU milliseconds, whole and by stage; peak "
+            "memory of the process in MB (and before the solve).",
+            table([*header, *SOLVER_STAGES, "MB"], lines),
+            *(["The solver's own words: " + "; ".join(said) + "."] if said else []),
+            "![time per observation](solver.png) ![memory](memory.png)",
+            "Two threads over one, on the wall:",
+            table(["frames", "whole", *SOLVER_STAGES], speed),
+        ]
+    )
+
+
+def _peers(results: Results) -> str:
+    lines = []
+    for name, found in results.items():
+        peer, _, frames = name.rpartition("-")
+        if peer not in PEERS:
+            continue
+        what = PEERS[peer]
+        if peer == "refractive-colmap" and not found["refractive"]:
+            what += " (its command has no refraction: pinholes)"
+        own = results.get(f"solver-{frames}")
+        lines.append([frames, what, *_peer_cells(found, own)])
+    if not lines:
+        return ""
+    lines.sort(key=lambda line: int(line[0]))
+    header = ["frames", "peer", "us", "ours, us", "ratio", "rms, px", "ours, px", "MB"]
+    text = "CPU per observation and iteration on one thread; memory of the process."
+    if not any(name.startswith("refractive-colmap") for name in results):
+        text += " No binary of Refractive COLMAP was given: its 18-22 us in the table "
+        text += "of targets were measured elsewhere."
+    return "## Peers\n\n" + text + "\n\n" + table(header, lines)
+
+
+PEERS = {
+    "colmap": "COLMAP, pinholes without water",
+    "scipy": "scipy.optimize.least_squares, this package's residuals",
+    "refractive-colmap": "Refractive COLMAP",
+}
+
+
+def _peer_cells(found: dict[str, Any], own: dict[str, Any] | None) -> list[str]:
+    memory = f"{found['peak_mb']:.0f}" if "peak_mb" in found else "-"
+    rms = f"{found['rms_px']:.3f}" if "rms_px" in found else "-"
+    theirs = found["us_per_observation"]
+    if own is None:
+        return [f"{theirs:.2f}", "-", "-", rms, "-", memory]
+    ours = own["one_thread"]["cpu_us_per_observation"]
+    return [
+        f"{theirs:.2f}",
+        f"{ours:.3f}",
+        f"{theirs / ours:.1f}",
+        rms,
+        f"{own['rms_px']:.3f}",
+        memory,
+    ]
+
+
+def _demo(results: Results) -> str:
+    found = results.get("demo")
+    if found is None or "wall_s" not in found:
+        return ""
+    total = found["wall_s"]
+    stages = dict(found["stages_s"])
+    stages["imports, evaluation and the rest"] = total - sum(stages.values())
+    lines = [[k, f"{v:.2f}", f"{100 * v / total:.0f} %"] for k, v in stages.items()]
+    lines.append(["whole", f"{total:.2f}", "100 %"])
+    return (
+        f"## `uwsfm demo`\n\nWarm, seconds on the wall with all cores; a second run in "
+        f"the same folder takes {found['second_run_s']:.1f} s, of which "
+        f"{found['second_start_s']:.1f} s are not its adjustment and export.\n\n"
+        + table(["stage", "s", "share"], lines)
+    )

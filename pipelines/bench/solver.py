@@ -1,0 +1,171 @@
+"""The whole solve of a survey, stage by stage, on one thread and on two."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import numpy as np
+import surveys
+from child import peak_memory_mb
+from threadpoolctl import threadpool_limits
+
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.solver import schur
+from uwsfm.solver.layout import Layout, build_layout
+from uwsfm.solver.levenberg_marquardt import (
+    LevenbergMarquardtOptions,
+    LevenbergMarquardtResult,
+    Problem,
+    minimize,
+)
+from uwsfm.solver.state import State
+from uwsfm.solver.threads import limited
+
+STAGES = (
+    "linearise",
+    "eliminate points",
+    "factor and solve",
+    "substitute back",
+    "cost",
+    "rest",
+)
+_PLACES: tuple[tuple[str, Any, str], ...] = (
+    ("linearise", Problem, "linearize"),
+    ("cost", Problem, "cost"),
+    ("step", Problem, "step"),
+    ("eliminate points", schur, "reduced_system"),
+    ("substitute back", schur, "substitute_back"),
+)
+Solve = Callable[[int], LevenbergMarquardtResult]
+
+
+def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, Any]:
+    """Times, memory and convergence of one survey.
+
+    Args:
+        num_frames: A size in `surveys.SPECS`.
+        folder: Of the surveys.
+        iterations_on_two: How many are timed on two threads; the solve on one thread
+            runs to its end.
+    """
+    truth = surveys.load(num_frames, folder)
+    start = surveys.start_of(truth)
+    columns = CalibrateOptions(loss="l2").border_columns(
+        start.cameras, np.zeros(len(start.cameras), dtype=bool)
+    )
+    before = peak_memory_mb()
+    messages = _listen()
+    clock = time.process_time()
+    layout, state = build_layout(start, columns), State.from_scene(start)
+    setup = time.process_time() - clock
+
+    def solve(max_iterations: int) -> LevenbergMarquardtResult:
+        options = LevenbergMarquardtOptions(max_iterations=max_iterations)
+        return minimize(layout, state, options)
+
+    one, result = _timed(solve, layout, num_threads=1, max_iterations=50)
+    two, _ = _timed(solve, layout, num_threads=2, max_iterations=iterations_on_two)
+    distances = result.state.ports[:, 3]
+    return {
+        "frames": start.num_frames,
+        "points": start.num_points,
+        "observations": start.num_observations,
+        "setup_s": setup,
+        "one_thread": one,
+        "two_threads": two,
+        "peak_mb": peak_memory_mb(),
+        "peak_before_mb": before,
+        "stop": result.stop.value,
+        "rms_px": float(np.sqrt(np.nanmean(result.squares))),
+        "noise_rms_px": surveys.NOISE_PX * float(np.sqrt(2.0)),
+        "distance_error_mm": [
+            1e3 * float(found - port.distance)
+            for found, port in zip(distances, truth.ports, strict=True)
+        ],
+        "log": sorted(set(messages)),
+    }
+
+
+def _timed(
+    solve: Solve, layout: Layout, num_threads: int, max_iterations: int
+) -> tuple[dict[str, Any], LevenbergMarquardtResult]:
+    with limited(num_threads), threadpool_limits(num_threads):
+        solve(1)  # loads the kernels and touches the memory
+        with stopwatch() as clocks:
+            wall, cpu = time.perf_counter(), time.process_time()
+            result = solve(max_iterations)
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    count = result.num_iterations
+    times = {
+        "iterations": count,
+        "wall_s": wall / count,
+        "cpu_s": cpu / count,
+        "cpu_us_per_observation": 1e6 * cpu / count / len(layout.xy),
+    }
+    for kind, total in (("wall_s", wall), ("cpu_s", cpu)):
+        stages = _exclusive(clocks[kind], total)
+        times[f"stages_{kind}"] = {stage: stages[stage] / count for stage in STAGES}
+    return times, result
+
+
+def _exclusive(clock: Counter[str], total: float) -> dict[str, float]:
+    """Stages that sum up to the total."""
+    missing = [stage for stage, _, _ in _PLACES if not clock[stage] > 0.0]
+    if missing:
+        raise RuntimeError(f"stage {missing[0]!r} was not called: has it moved?")
+    stages = {stage: clock[stage] for stage in STAGES}
+    inside = clock["eliminate points"] + clock["substitute back"]
+    stages["factor and solve"] = clock["step"] - inside
+    stages["rest"] = total - clock["linearise"] - clock["cost"] - clock["step"]
+    return stages
+
+
+@contextmanager
+def stopwatch() -> Iterator[dict[str, Counter[str]]]:
+    """Seconds of each stage, while this lasts: of the wall, and of all threads."""
+    clocks: dict[str, Counter[str]] = {"wall_s": Counter(), "cpu_s": Counter()}
+    with ExitStack() as stack:
+        for stage, owner, name in _PLACES:
+            stack.enter_context(_replaced(owner, name, _watched(stage, clocks)))
+        yield clocks
+
+
+def _watched(stage: str, clocks: dict[str, Counter[str]]) -> Callable:
+    def decorate(function: Callable) -> Callable:
+        def watched(*args: Any, **kwargs: Any) -> Any:
+            wall, cpu = time.perf_counter(), time.process_time()
+            result = function(*args, **kwargs)
+            clocks["wall_s"][stage] += time.perf_counter() - wall
+            clocks["cpu_s"][stage] += time.process_time() - cpu
+            return result
+
+        return watched
+
+    return decorate
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, decorate: Callable) -> Iterator[None]:
+    original = getattr(owner, name)
+    setattr(owner, name, decorate(original))
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)
+
+
+def _listen() -> list[str]:
+    """What the solver says of its choices."""
+    messages: list[str] = []
+
+    class Ears(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            messages.append(record.getMessage())
+
+    logger = logging.getLogger("uwsfm.solver")
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(Ears())
+    return messages
