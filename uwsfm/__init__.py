@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from uwsfm._load_order import refuse_broken_zlib
 
 if TYPE_CHECKING:
+    from uwsfm.batch import run_batch
     from uwsfm.calibration.bundle_adjustment import calibrate
     from uwsfm.calibration.error_budget import error_budget
     from uwsfm.calibration.lengths import Distances, Lengths, Positions
@@ -78,6 +79,7 @@ _HOMES = {
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
+    "run_batch": "uwsfm.batch",
 }
 
 __all__ = [
@@ -113,6 +115,7 @@ __all__ = [
     "reconstruct",
     "refine_model",
     "rig_of_refractive_colmap",
+    "run_batch",
     "verdicts",
 ]
 

@@ -1,0 +1,263 @@
+"""A survey in parts against the same survey in one piece.
+
+    python pipelines/surveys/lawn_mower.py -o OUT [--lines 5] [--per-line 60]
+
+Geometric observations of a lawn-mower track with 0.4 px of noise and 10 % of wrong
+matches; the rig file says what a user would. Both runs get the same matches, and end
+in the same refractive adjustment; OUT receives a table, and keeps what was computed.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwsfm._files import replaced_file
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.pipeline import start_scene
+from uwsfm.sfm.options import MappingOptions, StartOptions
+from uwsfm.sfm.refine import refine_scene
+from uwsfm.sfm.simulated import frames_of, write_features
+from uwsfm.sfm.start import start_from_matches
+from uwsfm.sfm.steps import Steps
+from uwsfm.simulate import ObservationOptions, Relief, SimulatedScene, simulate_scene
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
+from uwsfm.simulate.trajectories import lawn_mower
+from uwsfm.tasks import LOCAL
+
+RUNS = ("whole", "parts")
+WRONG = 0.1
+NAMES = {"whole": "one piece", "parts": "in parts"}
+POINTS_PER_FRAME = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """A track and where its runs are kept."""
+
+    lines: int
+    per_line: int
+    folder: Path
+
+    @property
+    def num_frames(self) -> int:
+        return self.lines * self.per_line
+
+    def poses(self) -> Array:
+        """Neighbours overlap by half or more, along and across; nothing is steady."""
+        rng = np.random.default_rng(0)
+        poses = lawn_mower(
+            self.lines, self.per_line, spacing=0.4, line_spacing=0.9, altitude=2.0
+        )
+        turns = np.radians(4.0) * rng.normal(size=(self.num_frames, 3))
+        shifts = rng.normal(size=(self.num_frames, 3)) * [0.05, 0.05, 0.25]
+        moves = np.concatenate([rigid3.quat_from_rotvec(turns), shifts], axis=1)
+        return rigid3.compose(moves, poses)
+
+    def simulate(self) -> SimulatedScene:
+        return simulate_scene(
+            sample_rig(),
+            self.poses(),
+            Relief(stddev=0.2, correlation_length=0.8),
+            ObservationOptions(
+                num_points=POINTS_PER_FRAME * self.num_frames,
+                noise_px=0.4,
+                detection_rate=0.6,
+                max_range=5.0,
+            ),
+        )
+
+
+def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
+    """Map and adjust; in a process of its own, whose memory is measured."""
+    work_dir = survey.folder / name
+    rig = nominal_rig(sample_rig())
+    frames = frames_of(rig, survey.num_frames, work_dir)
+    options = StartOptions(
+        mapper="refractive",
+        mapping=MappingOptions(
+            submap_frames=survey.num_frames if name == "whole" else part_frames
+        ),
+        scheduler=scheduler,
+    )
+
+    def tell(step: str, done: int, total: int | None) -> None:
+        if step in ("submaps", "merging"):
+            print(f"{name}: {step} {done} of {total}", flush=True)
+
+    start = start_from_matches(rig, frames, Steps(work_dir), "", options, tell)
+    arrays = start.arrays()
+    clock = time.monotonic()
+    refined = refine_scene(start_scene(rig, start, arrays), rig)
+    seconds = time.monotonic() - clock
+    calibration = refined.calibration
+    report = {
+        "timings_s": {**start.summary["timings_s"], "adjustment": seconds},
+        "submaps": start.summary.get("submaps"),
+        "num_registered": len(arrays.frame_names),
+        "num_points": calibration.summary.num_points,
+        "num_observations": calibration.summary.num_observations,
+        "sigma_px": calibration.summary.sigma_px,
+        "peak_mb": peak_mb(resource.RUSAGE_SELF),
+        "worker_peak_mb": peak_mb(resource.RUSAGE_CHILDREN),
+    }
+    names = [frames.names.index(frame) for frame in arrays.frame_names]
+    with replaced_file(work_dir / "result.npz") as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            frames=np.array(names),
+            poses=refined.scene.rig_from_world,
+            covariances=calibration.covariance.frames,
+            ports=np.array([port.row for port in refined.scene.ports]),
+            port_stddevs=np.array(
+                [
+                    [np.radians(c.normal_stddev_deg), c.distance_stddev_m]
+                    for c in calibration.covariance.cameras
+                ]
+            ),
+            report=json.dumps(report),
+        )
+
+
+def peak_mb(who: int) -> float:
+    return resource.getrusage(who).ru_maxrss / 1024.0
+
+
+def in_stddevs(poses: Array, others: Array, covariances: Array) -> Array:
+    """RMS over the six coordinates of each pose's difference, in its standard
+    deviations (F - 1,), with the first pose in common."""
+    first, second = (rigid3.compose(p, rigid3.inverse(p[:1])) for p in (poses, others))
+    turns = rigid3.compose(first, rigid3.inverse(second))
+    # Left tangent: x maps to Exp(w) (R x + t) + v.
+    turned = rigid3.compose(
+        np.concatenate([turns[:, :4], np.zeros((len(turns), 3))], axis=1), second
+    )
+    delta = np.concatenate(
+        [rigid3.rotvec_from_quat(turns[:, :4]), first[:, 4:] - turned[:, 4:]], axis=1
+    )[1:]
+    inverses = np.linalg.inv(covariances[1:])
+    return np.sqrt(np.einsum("fi,fij,fj->f", delta, inverses, delta) / 6.0)
+
+
+def center_rms_mm(poses: Array, others: Array) -> float:
+    first, second = (
+        rigid3.inverse(rigid3.compose(p, rigid3.inverse(p[:1])))[:, 4:]
+        for p in (poses, others)
+    )
+    return 1e3 * float(np.sqrt(np.mean(np.sum((first - second) ** 2, axis=1))))
+
+
+def compared(survey: Survey, runs: list[str]) -> dict[str, Any]:
+    """All numbers of the table."""
+    found: dict[str, Any] = {"num_frames": survey.num_frames}
+    results = {}
+    for name in runs:
+        with np.load(survey.folder / name / "result.npz") as stored:
+            results[name] = {key: stored[key] for key in stored.files}
+    truth = survey.poses()
+    for name, result in results.items():
+        true = truth[result["frames"]]
+        apart = in_stddevs(result["poses"], true, result["covariances"])
+        found[name] = {
+            **json.loads(str(result["report"])),
+            "truth_stddevs": float(np.sqrt(np.mean(apart**2))),
+            "center_rms_mm": center_rms_mm(result["poses"], true),
+        }
+    if len(results) == 2:
+        one, two = results["whole"], results["parts"]
+        _, *rows = np.intersect1d(one["frames"], two["frames"], return_indices=True)
+        apart = in_stddevs(
+            one["poses"][rows[0]], two["poses"][rows[1]], one["covariances"][rows[0]]
+        )
+        moved = (one["ports"] - two["ports"])[:, 3] / one["port_stddevs"][:, 1]
+        found["apart"] = {
+            "rms_stddevs": float(np.sqrt(np.mean(apart**2))),
+            "max_stddevs": float(apart.max()),
+            "center_rms_mm": center_rms_mm(
+                one["poses"][rows[0]], two["poses"][rows[1]]
+            ),
+            "port_distances_stddevs": moved.tolist(),
+        }
+    return found
+
+
+def rows_of(found: dict[str, Any]) -> list[str]:
+    rows = []
+    for name in RUNS:
+        if name not in found:
+            continue
+        run, times = found[name], found[name]["timings_s"]
+        mapping = times.get("submaps", 0.0)
+        parts = "-"
+        if run["submaps"]:
+            sizes = run["submaps"]["num_frames"]
+            parts = f"{len(sizes)} of {min(sizes)} to {max(sizes)}"
+        rows.append(
+            f"| {found['num_frames']} | {NAMES[name]} | {run['num_registered']} | "
+            f"{parts} | {mapping:.0f} | {times['mapping']:.0f} | "
+            f"{times['adjustment']:.0f} | {run['peak_mb']:.0f} | "
+            f"{run['num_observations']} | {run['center_rms_mm']:.2f} | "
+            f"{run['truth_stddevs']:.2f} |"
+        )
+    return rows
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--lines", type=int, default=5)
+    parser.add_argument("--per-line", type=int, default=60)
+    parser.add_argument("--part-frames", type=int, default=200)
+    parser.add_argument("--runs", default=",".join(RUNS), help="of: %(default)s")
+    parser.add_argument("--scheduler", default=LOCAL, help="of Dask: tcp://HOST:PORT")
+    parser.add_argument("--only", choices=RUNS, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = parse()
+    frames = options.lines * options.per_line
+    survey = Survey(
+        lines=options.lines,
+        per_line=options.per_line,
+        folder=options.out / f"work-{frames}",
+    )
+    if options.only:
+        run(survey, options.only, options.part_frames, options.scheduler)
+        return
+    runs = options.runs.split(",")
+    if not all((survey.folder / name / "database.db").exists() for name in runs):
+        simulated = survey.simulate()
+        rig = nominal_rig(sample_rig())
+        for name in runs:
+            work_dir = survey.folder / name
+            work_dir.mkdir(parents=True, exist_ok=True)
+            with replaced_file(work_dir / "database.db") as partial:
+                write_features(
+                    partial,
+                    simulated.scene,
+                    frames_of(rig, survey.num_frames, work_dir),
+                    wrong=WRONG,
+                )
+    for name in runs:
+        if not (survey.folder / name / "result.npz").exists():
+            subprocess.run([sys.executable, *sys.argv, "--only", name], check=True)
+    found = compared(survey, runs)
+    with replaced_file(options.out / f"lawn_mower_{frames}.json") as partial:
+        partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    print("\n".join(rows_of(found)))
+    print(json.dumps(found.get("apart")))
+
+
+if __name__ == "__main__":
+    main()
