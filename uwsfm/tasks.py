@@ -181,7 +181,7 @@ class Workers:
                 silence_logs=logging.ERROR,
                 worker_kwargs={
                     "local_directory": scratch,
-                    "env": {"NUMBA_NUM_THREADS": "1"},
+                    "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
                 },
             )
         self._resources.callback(cluster.close)
@@ -272,6 +272,7 @@ def _call(packed: tuple[list[str], bytes]) -> Any:
     script, on a disk that is shared.
     """
     paths, task = packed
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")  # tasks share the cores
     sys.path.extend(path for path in paths if path not in sys.path)
     import numpy  # noqa: F401  before pycolmap, which unpickling may import
     from threadpoolctl import threadpool_limits

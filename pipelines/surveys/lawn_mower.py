@@ -106,8 +106,7 @@ def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
         "num_points": calibration.summary.num_points,
         "num_observations": calibration.summary.num_observations,
         "sigma_px": calibration.summary.sigma_px,
-        "peak_mb": peak_mb(resource.RUSAGE_SELF),
-        "worker_peak_mb": peak_mb(resource.RUSAGE_CHILDREN),
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }
     names = [frames.names.index(frame) for frame in arrays.frame_names]
     with replaced_file(work_dir / "result.npz") as partial, partial.open("wb") as file:
@@ -125,10 +124,6 @@ def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
             ),
             report=json.dumps(report),
         )
-
-
-def peak_mb(who: int) -> float:
-    return resource.getrusage(who).ru_maxrss / 1024.0
 
 
 def in_stddevs(poses: Array, others: Array, covariances: Array) -> Array:
