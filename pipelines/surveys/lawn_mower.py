@@ -1,8 +1,8 @@
 """A survey in parts against the same survey in one piece.
 
-    python pipelines/surveys/lawn_mower.py -o OUT [--lines 5] [--per-line 60]
+    python pipelines/surveys/lawn_mower.py -o OUT [--frames 300] [--part-frames 100]
 
-Geometric observations of a lawn-mower track with 0.4 px of noise and 10 % of wrong
+Geometric observations of lines and cross lines over a floor, with 0.4 px of noise and 10 % of wrong
 matches; the rig file says what a user would. Both runs get the same matches, and end
 in the same refractive adjustment; OUT receives a table, and keeps what was computed.
 """
@@ -23,63 +23,59 @@ from uwsfm._files import replaced_file
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.pipeline import start_scene
+from uwsfm.rig import Rig
 from uwsfm.sfm.options import MappingOptions, StartOptions
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
-from uwsfm.simulate import ObservationOptions, Relief, SimulatedScene, simulate_scene
-from uwsfm.simulate.rigs import nominal_rig, sample_rig
-from uwsfm.simulate.trajectories import lawn_mower
+from uwsfm.simulate.rigs import nominal_rig, paper_rig
+from uwsfm.simulate.surveys import SurveySpec, simulate_survey, survey_track
 from uwsfm.tasks import LOCAL
 
 RUNS = ("whole", "parts")
+DATABASE = "database.db"
 WRONG = 0.1
+"""Share of wrong matches."""
 NAMES = {"whole": "one piece", "parts": "in parts"}
 POINTS_PER_FRAME = 120
 
 
 @dataclass(frozen=True, kw_only=True)
 class Survey:
-    """A track and where its runs are kept."""
+    """A survey and where its runs are kept."""
 
-    lines: int
-    per_line: int
+    num_frames: int
     folder: Path
 
     @property
-    def num_frames(self) -> int:
-        return self.lines * self.per_line
-
-    def poses(self) -> Array:
-        """Neighbours overlap by half or more, along and across; nothing is steady."""
-        rng = np.random.default_rng(0)
-        poses = lawn_mower(
-            self.lines, self.per_line, spacing=0.4, line_spacing=0.9, altitude=2.0
+    def spec(self) -> SurveySpec:
+        return SurveySpec(
+            num_frames=self.num_frames,
+            num_points=POINTS_PER_FRAME * self.num_frames,
+            detection_rate=0.6,
+            noise_px=0.4,
         )
-        turns = np.radians(4.0) * rng.normal(size=(self.num_frames, 3))
-        shifts = rng.normal(size=(self.num_frames, 3)) * [0.05, 0.05, 0.25]
-        moves = np.concatenate([rigid3.quat_from_rotvec(turns), shifts], axis=1)
-        return rigid3.compose(moves, poses)
 
-    def simulate(self) -> SimulatedScene:
-        return simulate_scene(
-            sample_rig(),
-            self.poses(),
-            Relief(stddev=0.2, correlation_length=0.8),
-            ObservationOptions(
-                num_points=POINTS_PER_FRAME * self.num_frames,
-                noise_px=0.4,
-                detection_rate=0.6,
-                max_range=5.0,
-            ),
-        )
+    def rig(self) -> Rig:
+        """What a user would write: straight ports at half their distance."""
+        return nominal_rig(paper_rig())
+
+    def write(self, names: list[str]) -> None:
+        """The same features for each run."""
+        scene = simulate_survey(self.spec).scene
+        for name in names:
+            work_dir = self.folder / name
+            work_dir.mkdir(parents=True, exist_ok=True)
+            frames = frames_of(self.rig(), self.num_frames, work_dir)
+            with replaced_file(work_dir / DATABASE) as partial:
+                write_features(partial, scene, frames, wrong=WRONG)
 
 
 def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
     """Map and adjust; in a process of its own, whose memory is measured."""
     work_dir = survey.folder / name
-    rig = nominal_rig(sample_rig())
+    rig = survey.rig()
     frames = frames_of(rig, survey.num_frames, work_dir)
     options = StartOptions(
         mapper="refractive",
@@ -157,7 +153,7 @@ def compared(survey: Survey, runs: list[str]) -> dict[str, Any]:
     for name in runs:
         with np.load(survey.folder / name / "result.npz") as stored:
             results[name] = {key: stored[key] for key in stored.files}
-    truth = survey.poses()
+    truth = survey_track(survey.spec)
     for name, result in results.items():
         true = truth[result["frames"]]
         apart = in_stddevs(result["poses"], true, result["covariances"])
@@ -210,9 +206,8 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--lines", type=int, default=5)
-    parser.add_argument("--per-line", type=int, default=60)
-    parser.add_argument("--part-frames", type=int, default=200)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--part-frames", type=int, default=100)
     parser.add_argument("--runs", default=",".join(RUNS), help="of: %(default)s")
     parser.add_argument("--scheduler", default=LOCAL, help="of Dask: tcp://HOST:PORT")
     parser.add_argument("--only", choices=RUNS, help=argparse.SUPPRESS)
@@ -221,34 +216,19 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     options = parse()
-    frames = options.lines * options.per_line
     survey = Survey(
-        lines=options.lines,
-        per_line=options.per_line,
-        folder=options.out / f"work-{frames}",
+        num_frames=options.frames, folder=options.out / f"work-{options.frames}"
     )
     if options.only:
         run(survey, options.only, options.part_frames, options.scheduler)
         return
     runs = options.runs.split(",")
-    if not all((survey.folder / name / "database.db").exists() for name in runs):
-        simulated = survey.simulate()
-        rig = nominal_rig(sample_rig())
-        for name in runs:
-            work_dir = survey.folder / name
-            work_dir.mkdir(parents=True, exist_ok=True)
-            with replaced_file(work_dir / "database.db") as partial:
-                write_features(
-                    partial,
-                    simulated.scene,
-                    frames_of(rig, survey.num_frames, work_dir),
-                    wrong=WRONG,
-                )
+    survey.write([n for n in runs if not (survey.folder / n / DATABASE).exists()])
     for name in runs:
         if not (survey.folder / name / "result.npz").exists():
             subprocess.run([sys.executable, *sys.argv, "--only", name], check=True)
     found = compared(survey, runs)
-    with replaced_file(options.out / f"lawn_mower_{frames}.json") as partial:
+    with replaced_file(options.out / f"lawn_mower_{options.frames}.json") as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print("\n".join(rows_of(found)))
     print(json.dumps(found.get("apart")))
