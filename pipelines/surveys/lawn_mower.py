@@ -2,9 +2,10 @@
 
     python pipelines/surveys/lawn_mower.py -o OUT [--frames 300] [--part-frames 100]
 
-Geometric observations of lines and cross lines over a floor, with 0.4 px of noise and 10 % of wrong
-matches; the rig file says what a user would. Both runs get the same matches, and end
-in the same refractive adjustment; OUT receives a table, and keeps what was computed.
+Geometric observations of lines and cross lines over a floor, with 0.4 px of noise and
+10 % of wrong matches; the rig file says what a user would. Both runs get the same
+matches, and end in the same refractive adjustment; OUT receives the numbers, and keeps
+what was computed.
 """
 
 import argparse
