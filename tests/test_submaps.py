@@ -1,6 +1,7 @@
 """Surveys in parts: the parts, their places, and the map that they become."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.alignment import align
 from uwsfm.geometry.joint_alignment import Link, align_jointly
 from uwsfm.pipeline import start_scene
-from uwsfm.rig import Rig
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.options import MappingOptions, StartOptions
@@ -118,7 +119,9 @@ def test_maps_without_a_link_have_worlds_of_their_own(rng):
 class Survey:
     """A lawn-mower track over relief, and its features."""
 
-    def __init__(self, work_dir: Path, num_lines: int, per_line: int) -> None:
+    def __init__(
+        self, work_dir: Path, num_lines: int, per_line: int, num_cameras: int = 2
+    ) -> None:
         num_frames = num_lines * per_line
         rng = np.random.default_rng(0)
         poses = lawn_mower(num_lines, per_line, spacing=0.4, line_spacing=0.9)
@@ -138,10 +141,15 @@ class Survey:
                 max_range=5.0,
             ),
         )
-        self.rig: Rig = nominal_rig(sample_rig())
+        scene, self.rig = self.simulated.scene, nominal_rig(sample_rig())
+        if num_cameras == 1:
+            scene, _ = scene.select(scene.camera_idx == 0)
+            alone = {"cam_from_rig": scene.cam_from_rig[:1]}
+            scene = replace(scene, cameras=scene.cameras[:1], **alone)
+            cameras = sample_rig().cameras[:1]  # one camera cannot tell its port
+            self.rig = replace(self.rig, cameras=cameras, baseline_m=None, **alone)
         self.frames: Frames = frames_of(self.rig, num_frames, work_dir)
         self.work_dir = work_dir
-        scene = self.simulated.scene
         write_features(work_dir / "database.db", scene, self.frames, wrong=0.1)
 
     def start(
@@ -151,6 +159,7 @@ class Survey:
             mapper="refractive",
             mapping=MappingOptions(submap_frames=submap_frames),
             num_threads=num_threads,
+            scene_distance_m=2.0,
         )
         steps = Steps(self.work_dir)
         start = start_from_matches(self.rig, self.frames, steps, "", options, progress)
@@ -215,6 +224,24 @@ def _check_that_finished_parts_stay(survey: Survey) -> None:
 def test_a_part_needs_frames():
     with pytest.raises(InputError, match="submap_frames must be at least 10, got 2"):
         MappingOptions(submap_frames=2)
+
+
+@pytest.mark.slow
+def test_parts_of_one_camera_agree_but_for_a_scale(tmp_path):
+    """Every part has a scale of its own; the whole has one, which nothing tells."""
+    survey = Survey(tmp_path, 4, 12, num_cameras=1)
+    expected = survey.refined(survey.start(submap_frames=48))
+    start = survey.start(submap_frames=18)
+    assert len(start.summary["submaps"]["num_frames"]) >= 3
+    found = survey.refined(start)
+    assert found.calibration.covariance.scale_stddev is None
+    one, two = (
+        rigid3.inverse(r.scene.rig_from_world)[:, 4:] for r in (expected, found)
+    )
+    assert len(one) == len(two) >= 47
+    alignment = align(two, one, np.ones(len(one)), with_scale=True)
+    # The same least squares: only tracks at the tolerance could differ.
+    assert np.linalg.norm(alignment.apply(two) - one, axis=1).max() < 1e-4
 
 
 @pytest.mark.slow
