@@ -172,18 +172,21 @@ class Workers:
         scratch = self._resources.enter_context(
             tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
         )
-        start: Any = LocalCluster if sys.platform == "win32" else SubprocessCluster
+        common: dict[str, Any] = {
+            "n_workers": self.num_processes,
+            "threads_per_worker": 1,
+            "dashboard_address": None,
+            "silence_logs": logging.ERROR,
+        }
+        each: dict[str, Any] = {
+            "local_directory": scratch,
+            "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
+        }
         with dask.config.set({"temporary-directory": scratch}):
-            cluster = start(
-                n_workers=self.num_processes,
-                threads_per_worker=1,
-                dashboard_address=None,
-                silence_logs=logging.ERROR,
-                worker_kwargs={
-                    "local_directory": scratch,
-                    "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
-                },
-            )
+            if sys.platform == "win32":  # where processes can only be spawned
+                cluster = LocalCluster(**common, **each)
+            else:
+                cluster = SubprocessCluster(**common, worker_kwargs=each)
         self._resources.callback(cluster.close)
         self._client = Client(cluster)
         self._resources.callback(self._client.close)

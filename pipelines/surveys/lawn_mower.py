@@ -16,13 +16,11 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from comparison import RESULT, RUNS, compared, page
 
 from uwsfm._files import replaced_file
-from uwsfm.geometry import rigid3
-from uwsfm.geometry.rigid3 import Array
 from uwsfm.pipeline import start_scene
 from uwsfm.rig import Rig
 from uwsfm.sfm.options import MappingOptions, StartOptions
@@ -34,11 +32,9 @@ from uwsfm.simulate.rigs import nominal_rig, paper_rig
 from uwsfm.simulate.surveys import SurveySpec, simulate_survey, survey_track
 from uwsfm.tasks import LOCAL
 
-RUNS = ("whole", "parts")
 DATABASE = "database.db"
 WRONG = 0.1
 """Share of wrong matches."""
-NAMES = {"whole": "one piece", "parts": "in parts"}
 POINTS_PER_FRAME = 120
 
 
@@ -106,7 +102,7 @@ def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }
     names = [frames.names.index(frame) for frame in arrays.frame_names]
-    with replaced_file(work_dir / "result.npz") as partial, partial.open("wb") as file:
+    with replaced_file(work_dir / RESULT) as partial, partial.open("wb") as file:
         np.savez(
             file,
             frames=np.array(names),
@@ -121,85 +117,6 @@ def run(survey: Survey, name: str, part_frames: int, scheduler: str) -> None:
             ),
             report=json.dumps(report),
         )
-
-
-def in_stddevs(poses: Array, others: Array, covariances: Array) -> Array:
-    """RMS over the six coordinates of each pose's difference, in its standard
-    deviations (F - 1,), with the first pose in common."""
-    first, second = (rigid3.compose(p, rigid3.inverse(p[:1])) for p in (poses, others))
-    turns = rigid3.compose(first, rigid3.inverse(second))
-    # Left tangent: x maps to Exp(w) (R x + t) + v.
-    turned = rigid3.compose(
-        np.concatenate([turns[:, :4], np.zeros((len(turns), 3))], axis=1), second
-    )
-    delta = np.concatenate(
-        [rigid3.rotvec_from_quat(turns[:, :4]), first[:, 4:] - turned[:, 4:]], axis=1
-    )[1:]
-    inverses = np.linalg.inv(covariances[1:])
-    return np.sqrt(np.einsum("fi,fij,fj->f", delta, inverses, delta) / 6.0)
-
-
-def center_rms_mm(poses: Array, others: Array) -> float:
-    first, second = (
-        rigid3.inverse(rigid3.compose(p, rigid3.inverse(p[:1])))[:, 4:]
-        for p in (poses, others)
-    )
-    return 1e3 * float(np.sqrt(np.mean(np.sum((first - second) ** 2, axis=1))))
-
-
-def compared(survey: Survey, runs: list[str]) -> dict[str, Any]:
-    """All numbers of the table."""
-    found: dict[str, Any] = {"num_frames": survey.num_frames}
-    results = {}
-    for name in runs:
-        with np.load(survey.folder / name / "result.npz") as stored:
-            results[name] = {key: stored[key] for key in stored.files}
-    truth = survey_track(survey.spec)
-    for name, result in results.items():
-        true = truth[result["frames"]]
-        apart = in_stddevs(result["poses"], true, result["covariances"])
-        found[name] = {
-            **json.loads(str(result["report"])),
-            "truth_stddevs": float(np.sqrt(np.mean(apart**2))),
-            "center_rms_mm": center_rms_mm(result["poses"], true),
-        }
-    if len(results) == 2:
-        one, two = results["whole"], results["parts"]
-        _, *rows = np.intersect1d(one["frames"], two["frames"], return_indices=True)
-        apart = in_stddevs(
-            one["poses"][rows[0]], two["poses"][rows[1]], one["covariances"][rows[0]]
-        )
-        moved = (one["ports"] - two["ports"])[:, 3] / one["port_stddevs"][:, 1]
-        found["apart"] = {
-            "rms_stddevs": float(np.sqrt(np.mean(apart**2))),
-            "max_stddevs": float(apart.max()),
-            "center_rms_mm": center_rms_mm(
-                one["poses"][rows[0]], two["poses"][rows[1]]
-            ),
-            "port_distances_stddevs": moved.tolist(),
-        }
-    return found
-
-
-def rows_of(found: dict[str, Any]) -> list[str]:
-    rows = []
-    for name in RUNS:
-        if name not in found:
-            continue
-        run, times = found[name], found[name]["timings_s"]
-        mapping = times.get("submaps", 0.0)
-        parts = "-"
-        if run["submaps"]:
-            sizes = run["submaps"]["num_frames"]
-            parts = f"{len(sizes)} of {min(sizes)} to {max(sizes)}"
-        rows.append(
-            f"| {found['num_frames']} | {NAMES[name]} | {run['num_registered']} | "
-            f"{parts} | {mapping:.0f} | {times['mapping']:.0f} | "
-            f"{times['adjustment']:.0f} | {run['peak_mb']:.0f} | "
-            f"{run['num_observations']} | {run['center_rms_mm']:.2f} | "
-            f"{run['truth_stddevs']:.2f} |"
-        )
-    return rows
 
 
 def parse() -> argparse.Namespace:
@@ -226,13 +143,14 @@ def main() -> None:
     runs = options.runs.split(",")
     survey.write([n for n in runs if not (survey.folder / n / DATABASE).exists()])
     for name in runs:
-        if not (survey.folder / name / "result.npz").exists():
+        if not (survey.folder / name / RESULT).exists():
             subprocess.run([sys.executable, *sys.argv, "--only", name], check=True)
-    found = compared(survey, runs)
+    found = compared(survey.folder, survey_track(survey.spec), runs)
     with replaced_file(options.out / f"lawn_mower_{options.frames}.json") as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    print("\n".join(rows_of(found)))
-    print(json.dumps(found.get("apart")))
+    with replaced_file(options.out / "lawn_mower.md") as partial:
+        partial.write_text(page(options.out), encoding="utf-8")
+    print(options.out / "lawn_mower.md")
 
 
 if __name__ == "__main__":
