@@ -60,26 +60,26 @@ if CACHE_DIR is not None:
     config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
-def kernel(function: Function) -> Function:
-    """Compile with numba: releases the GIL, IEEE division, cached on disk."""
-    compiled: Any = numba.njit(
-        cache=CACHE_DIR is not None, nogil=True, error_model="numpy"
-    )
-    return compiled(function)
-
+_OPTIONS: dict[str, Any] = {
+    "cache": CACHE_DIR is not None,
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+}
 
 # What SIMD needs and no more: sums may be regrouped, NaN stays NaN.
 _LANE_MATH = {"nsz", "arcp", "contract", "reassoc"}
 
 
+def kernel(function: Function) -> Function:
+    """Compile with numba: releases the GIL, IEEE division, cached on disk."""
+    compiled: Any = numba.njit(**_OPTIONS)
+    return compiled(function)
+
+
 def fused(function: Function) -> Function:
-    """Compile a kernel whose sums may be fused and regrouped, as those of lanes are."""
-    compiled: Any = numba.njit(
-        cache=CACHE_DIR is not None,
-        nogil=True,
-        error_model="numpy",
-        fastmath=_LANE_MATH,
-    )
+    """Compile a kernel whose sums may be regrouped, as those of lanes are."""
+    compiled: Any = numba.njit(**_OPTIONS, fastmath=_LANE_MATH)
     return compiled(function)
 
 
@@ -89,11 +89,5 @@ def lane(function: Function) -> Function:
     It becomes part of its caller, else the caller's loop would not vectorise: keep it
     free of branches (min, max, `x if ok else y`), inner loops and arrays of any length.
     """
-    compiled: Any = numba.njit(
-        cache=CACHE_DIR is not None,
-        nogil=True,
-        error_model="numpy",
-        fastmath=_LANE_MATH,
-        forceinline=True,
-    )
+    compiled: Any = numba.njit(**_OPTIONS, fastmath=_LANE_MATH, forceinline=True)
     return compiled(function)

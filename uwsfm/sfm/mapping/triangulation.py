@@ -366,7 +366,9 @@ def _triangulate_batch(
     views, track_start, keypoints, limit, max_cosine, min_images, points, point_of
 ):
     """Loop over tracks: writes points and point_of, returns the number of points."""
-    largest = np.diff(track_start).max() if len(track_start) > 1 else 0
+    largest = 0
+    for t in range(len(track_start) - 1):
+        largest = max(largest, track_start[t + 1] - track_start[t])
     left, chosen = np.empty(largest, np.int64), np.empty(largest, np.int64)
     jac = np.empty((2, JAC_SIZE))
     num_points = 0
