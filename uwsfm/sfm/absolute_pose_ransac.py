@@ -91,9 +91,9 @@ def search_pose(samples, rays, matches, rig, limit, best, pose):
                 matches,
                 squares < limit,
                 rig,
-                CAUCHY,
+                np.int64(CAUCHY),  # a literal would compile everything once more
                 0.5 * math.sqrt(limit),
-                LOCAL_ITERATIONS,
+                np.int64(LOCAL_ITERATIONS),
             )
             error, count = truncated_error(local, matches, rig, limit, best)
             if error < best:

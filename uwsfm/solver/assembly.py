@@ -115,12 +115,15 @@ def add_cell(x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, out):
     t01, t11, t21 = _torque(x, y, z, h10, h11, h21)
     t02, t12, t22 = _torque(x, y, z, h20, h21, h22)
     cells = out.cells
-    _add_pose_row(0, x, y, z, t00, t01, t02, frame, f, c, frames, cells)
-    _add_pose_row(1, x, y, z, t10, t11, t12, frame, f, c, frames, cells)
-    _add_pose_row(2, x, y, z, t20, t21, t22, frame, f, c, frames, cells)
-    a = _add_pose_row(3, x, y, z, h00, h10, h20, frame, f, c, frames, cells)
-    b = _add_pose_row(4, x, y, z, h10, h11, h21, frame, f, c, frames, cells)
-    d = _add_pose_row(5, x, y, z, h20, h21, h22, frame, f, c, frames, cells)
+    # Literals would compile the function once for each of them.
+    row0, row1, row2 = np.int64(0), np.int64(1), np.int64(2)
+    row3, row4, row5 = np.int64(3), np.int64(4), np.int64(5)
+    _add_pose_row(row0, x, y, z, t00, t01, t02, frame, f, c, frames, cells)
+    _add_pose_row(row1, x, y, z, t10, t11, t12, frame, f, c, frames, cells)
+    _add_pose_row(row2, x, y, z, t20, t21, t22, frame, f, c, frames, cells)
+    a = _add_pose_row(row3, x, y, z, h00, h10, h20, frame, f, c, frames, cells)
+    b = _add_pose_row(row4, x, y, z, h10, h11, h21, frame, f, c, frames, cells)
+    d = _add_pose_row(row5, x, y, z, h20, h21, h22, frame, f, c, frames, cells)
     q0, q1, q2 = _torque(x, y, z, g0, g1, g2)
     frames_grad[f, 0] += q0
     frames_grad[f, 1] += q1
