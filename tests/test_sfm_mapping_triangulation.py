@@ -9,7 +9,9 @@ from sfm_scenes import simulated_dive
 from uwsfm.geometry import rigid3
 from uwsfm.scene import Scene
 from uwsfm.sfm.epipolar import ray_gaps_px
-from uwsfm.sfm.mapping.triangulation import Views, match_gaps_px, triangulate
+from uwsfm.sfm.mapping import tracks
+from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
+from uwsfm.sfm.mapping.triangulation import Views
 from uwsfm.solver.state import State
 
 MIN_ANGLE = np.radians(1.5)
@@ -121,6 +123,22 @@ def test_parallel_rays_and_too_few_images_give_no_point(scene):
     assert len(find(scene, same_place).points) == 0
     assert len(find(scene, track[:2]).points) == 1
     assert len(find(scene, track[:2], min_images=3).points) == 0
+
+
+def test_points_and_gaps_do_not_depend_on_the_number_of_threads(scene, monkeypatch):
+    lists = often_seen(scene, 200)
+    start = np.concatenate([[0], np.cumsum([len(track) for track in lists])])
+    keypoints = np.concatenate(lists)
+    pairs = np.array([(track[0], track[-1]) for track in lists])
+    views, found = views_of(scene), []
+    monkeypatch.setattr(tracks, "MIN_CHUNK", 20)
+    for count in (1, 5):
+        monkeypatch.setattr(tracks, "num_threads", lambda count=count: count)
+        points = tracks.triangulate(views, start, keypoints, 2.0, np.radians(1.5))
+        found.append((*points, match_gaps_px(views, pairs)))
+    assert len(found[0][0]) > 100
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_gaps_agree_with_the_two_view_geometry(scene):

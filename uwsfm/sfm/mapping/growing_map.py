@@ -13,7 +13,8 @@ from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.observers import Chains, errors_px
-from uwsfm.sfm.mapping.triangulation import Views, match_gaps_px, triangulate
+from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
+from uwsfm.sfm.mapping.triangulation import Views
 
 Mask = NDArray[np.bool_]
 

@@ -51,71 +51,6 @@ class Views(NamedTuple):
     """(N, 3) unit."""
 
 
-class Found(NamedTuple):
-    """Points of tracks."""
-
-    points: Array
-    """(P, 3) in the world."""
-    point_of: IndexArray
-    """For each keypoint of the tracks, its point; -1: none."""
-
-
-def triangulate(
-    views: Views,
-    track_start: IndexArray,
-    keypoints: IndexArray,
-    max_error_px: float,
-    min_angle: float,
-    min_images: int = 2,
-) -> Found:
-    """Find the points of tracks.
-
-    Args:
-        views: Poses and rays.
-        track_start: (T + 1,) where each track begins in ``keypoints``.
-        keypoints: (K,) track after track, rising within a track, which puts those of
-            one image beside each other.
-        max_error_px: Tolerance, true pixels.
-        min_angle: Between the two rays of a point that diverge most, radians.
-        min_images: That see a point. Two always agree on their epipolar line; a third
-            tells wrong matches.
-
-    Returns:
-        Points in the order of the tracks.
-    """
-    point_of = np.full(len(keypoints), -1, dtype=np.int64)
-    points = np.empty((len(keypoints) // 2 + 1, 3))
-    count = _triangulate_batch(
-        views,
-        track_start,
-        keypoints,
-        max_error_px * max_error_px,
-        math.cos(min_angle),
-        min_images,
-        points,
-        point_of,
-    )
-    return Found(points=points[:count].copy(), point_of=point_of)
-
-
-def match_gaps_px(views: Views, ends: IndexArray) -> Array:
-    """How many pixels the keypoints of matches miss a common point by.
-
-    As `epipolar.ray_gaps_px`, for many images at once. Rays whose angle is a matter of
-    noise may as well meet behind the cameras: they miss by no more than that angle.
-
-    Args:
-        views: Poses and rays.
-        ends: (n, 2) keypoints of each match.
-
-    Returns:
-        (n,); inf where a pixel has no ray or the rays clearly meet behind a port.
-    """
-    gaps = np.empty(len(ends))
-    _match_gaps_batch(views, ends, gaps)
-    return gaps
-
-
 @kernel
 def squared_error(views, keypoint, x, y, z):
     """Squared reprojection error of a keypoint at a world point; inf if invalid."""
@@ -189,7 +124,7 @@ def _gap(views, a, b, x, y, z, jac):
 
 
 @kernel
-def _match_gaps_batch(views, ends, gaps):
+def match_gaps_batch(views, ends, gaps):
     """Loop over matches: gaps (n,), written."""
     jac = np.empty((2, JAC_SIZE))
     for k in range(len(ends)):
@@ -362,7 +297,7 @@ def _take(views, track, point_of, chosen, count, point, x, y, z, limit):
 
 
 @kernel
-def _triangulate_batch(
+def triangulate_batch(
     views, track_start, keypoints, limit, max_cosine, min_images, points, point_of
 ):
     """Loop over tracks: writes points and point_of, returns the number of points."""
