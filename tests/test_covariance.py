@@ -58,9 +58,9 @@ def test_every_marginal_is_that_of_the_dense_normal_matrix():
         error = np.abs(found - expected) / np.outer(spread, spread)
         assert error.max() < 1e-7
 
-    assert_close(reduced.border(layout), dense[offset:size, offset:size])
+    assert_close(reduced.border, dense[offset:size, offset:size])
     for frame, column in enumerate(layout.frame_col):
-        block = reduced.frames(layout)[frame]
+        block = reduced.frames[frame]
         if column == HELD:
             assert not block.any()
         else:
@@ -91,7 +91,7 @@ def test_border_of_500_frames_is_that_of_the_sparse_normal_matrix():
         scale[inside], scale[inside]
     )
     spread = np.sqrt(np.diag(expected))
-    error = np.abs(reduced.border(layout) - expected) / np.outer(spread, spread)
+    error = np.abs(reduced.border - expected) / np.outer(spread, spread)
     # A survey bends: the scaled matrix has condition 1e9, 1e-16 of it twice.
     assert error.max() < 1e-5
 
@@ -147,7 +147,7 @@ def test_free_scale_is_found_to_be_undetermined():
         layout, eqs = linearized(scene, options)
         reduced = reduced_covariance(layout, eqs)
         assert reduced.determined is determined
-        assert np.isnan(reduced.border(layout)).all() != determined
+        assert np.isnan(reduced.border).all() != determined
         points = point_covariances(layout, eqs, reduced)
         assert np.isnan(points).all() != determined
 

@@ -184,8 +184,8 @@ def test_covariance_with_terms_is_that_of_the_dense_matrix(rng):
         # Rows by differences (1e-9), times the condition of the scaled matrix.
         assert np.abs((found - expected) / np.outer(spread, spread)).max() < 1e-5
 
-    assert_close(reduced.border(layout), slice(layout.num_frame_cols, cameras))
-    assert_close(reduced.navigation(layout), slice(cameras, size))
+    assert_close(reduced.border, slice(layout.num_frame_cols, cameras))
+    assert_close(reduced.navigation, slice(cameras, size))
     for p, block in enumerate(point_covariances(layout, eqs, reduced)):
         assert_close(block, slice(size + 3 * p, size + 3 * p + 3))
 

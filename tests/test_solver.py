@@ -13,6 +13,7 @@ from uwsfm.residuals.border import BORDER_SIZE, LENGTH
 from uwsfm.simulate import Perturbation, perturbed
 from uwsfm.solver import assembly, chunks, normal_equations, schur
 from uwsfm.solver import levenberg_marquardt as lm
+from uwsfm.solver.block_graph import build_graph
 from uwsfm.solver.error_models import error_model
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.losses import INVALID_PX, rho
@@ -253,15 +254,18 @@ def test_compiled_kernels_equal_their_python():
     normal_equations.scatter(layout, sums, slow)
     for a, b in zip(fast, slow, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(a).max())
-    size = layout.num_frame_cols + layout.num_border_cols
+    graph = build_graph(layout)
     results = []
-    for kernel in (schur.eliminate_points, python_of(schur.eliminate_points)):
-        matrix, right, inverses = (
-            np.empty((size, size)),
-            np.empty(size),
-            0 * fast.points,
-        )
-        kernel(layout, fast, 1e-4, layout.num_frame_cols, inverses, matrix, right)
-        results.append((np.tril(matrix), right, inverses))
+    for invert, eliminate in (
+        (schur.invert_points, schur.eliminate_rows),
+        (python_of(schur.invert_points), python_of(schur.eliminate_rows)),
+    ):
+        system = schur.empty_system(layout, graph)
+        system.border[:], system.right_border[:] = fast.border, 0.0
+        sums = (system.inverses, system.border, system.right_border)
+        invert(fast, 1e-4, 0, len(fast.points), *sums)
+        rows = (0, graph.num_frames)
+        eliminate(layout.point_start, graph, fast, 1e-4, *rows, system)
+        results.append(system)
     for a, b in zip(*results, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(a).max())

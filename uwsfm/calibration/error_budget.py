@@ -22,7 +22,9 @@ from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver import schur
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import suitable_blas
-from uwsfm.solver.quasidefinite import inverse_of_lower, without_forces
+from uwsfm.solver.quasidefinite import symmetric
+from uwsfm.solver.reduced_factor import inverse
+from uwsfm.solver.reduction import analyse
 
 FOCAL, CX, CY = border.FIRST_LENS, border.FIRST_LENS + 2, border.FIRST_LENS + 3
 
@@ -133,23 +135,31 @@ def _propagate(
     own = border_priors(scene, settings, columns, sigma)
     used, frames = np.unique(scene.point_idx), np.unique(scene.frame_idx)
     priors = with_terms(own, outside.terms(used, frames, sigma), state)
-    with suitable_blas(layout):
+    reduction, offset = analyse(layout), layout.num_frame_cols
+    with suitable_blas(reduction):
         eqs = likelihood(layout, state, priors)
-        lower, _, _ = schur.reduced_system(layout, eqs, 0.0)
-        lower, _, _ = without_forces(lower, layout.num_lengths)
-        # The order of the border is that of the columns: the given ones come last.
-        split = layout.num_frame_cols + num_free
-        coupling = lower[split:, :split]
-        inverse = inverse_of_lower(np.ascontiguousarray(lower[:split, :split]))
-    steps = np.full(changes.shape, np.nan)
-    if inverse is None:
-        return steps
-    right = -changes[:, given] @ coupling
-    if priors is not None:
-        known = (priors.weights > 0.0) & (columns != HELD)
-        pulled = changes[:, known] * priors.weights[known]
-        np.add.at(right.T, layout.num_frame_cols + columns[known], pulled.T)
-    border_steps = (right @ inverse)[:, layout.num_frame_cols :]
+        whole = schur.reduced_system(layout, reduction.graph, eqs, 0.0)
+        border = symmetric(whole.border)
+        # The order of the border is that of the columns: the given ones come last, but
+        # for the lengths.
+        kept = np.r_[:num_free, layout.num_camera_cols : layout.num_border_cols]
+        moved = np.arange(num_free, layout.num_camera_cols)
+        part = whole._replace(
+            coupling=np.ascontiguousarray(whole.coupling[:, :, kept]),
+            border=border[np.ix_(kept, kept)],
+            right_border=whole.right_border[kept],
+        )
+        found = inverse(reduction, part, layout.num_lengths)
+        if found is None:
+            return np.full(changes.shape, np.nan)
+        coupling = whole.coupling[:, :, moved].reshape(offset, len(moved))
+        right = -np.concatenate([coupling, border[np.ix_(kept, moved)]])
+        right = right @ changes[:, given].T  # (n, E)
+        if priors is not None:
+            known = (priors.weights > 0.0) & (columns != HELD)
+            pulled = changes[:, known] * priors.weights[known]
+            np.add.at(right, offset + columns[known], pulled.T)
+        border_steps = found.times(right)[offset : offset + num_free].T
     padded = np.concatenate([border_steps, np.zeros((len(changes), 1))], axis=1)
     return padded[:, columns]  # HELD = -1 reads the zeros at the end
 

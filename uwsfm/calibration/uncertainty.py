@@ -16,7 +16,6 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DOME, KIND, DomePort
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver import schur
 from uwsfm.solver.clustered import clustered_covariance
 from uwsfm.solver.covariance import (
     ReducedCovariance,
@@ -32,6 +31,7 @@ from uwsfm.solver.levenberg_marquardt import (
     suitable_blas,
 )
 from uwsfm.solver.normal_equations import NormalEquations, empty_normal_equations
+from uwsfm.solver.reduction import Reduction, analyse
 from uwsfm.solver.state import State, translation_arm
 from uwsfm.solver.terms import centers
 
@@ -75,20 +75,23 @@ class Posterior(NamedTuple):
 def posterior_covariance(optimum: Optimum) -> Posterior:
     """Covariances from the noise found, and standard deviations that neighbours' shared
     errors cannot beat."""
-    with suitable_blas(optimum.layout):
-        return _posterior_covariance(optimum)
+    reduction = analyse(optimum.layout)
+    with suitable_blas(reduction):
+        return _posterior_covariance(optimum, reduction)
 
 
 def scale_stddev(optimum: Optimum) -> float:
     """Relative standard deviation of the scale; infinite if it is open."""
-    with suitable_blas(optimum.layout):
+    reduction = analyse(optimum.layout)
+    with suitable_blas(reduction):
         eqs = likelihood(optimum.layout, optimum.state, optimum.priors)
-        reduced = reduced_covariance(optimum.layout, eqs)
-    if not reduced.determined:
-        return np.inf
-    return optimum.sigma_px * _scale_stddev(
-        optimum.layout, optimum.state, reduced, optimum.scale_ends
-    )
+        reduced = reduced_covariance(optimum.layout, eqs, reduction)
+        if not reduced.determined:
+            return np.inf
+        stddev = _scale_stddev(
+            optimum.layout, optimum.state, reduced, optimum.scale_ends
+        )
+    return optimum.sigma_px * stddev
 
 
 def _scale_stddev(
@@ -99,21 +102,21 @@ def _scale_stddev(
     length = float(np.linalg.norm(first - second))
     if length == 0.0:
         return 0.0
-    slope = np.zeros(len(reduced.matrix))
+    slope = np.zeros(layout.num_frame_cols + layout.num_border_cols)
     for frame, sign in zip(ends, (1.0, -1.0), strict=True):
         col = int(layout.frame_col[frame])
         if col != HELD:
             away = sign * (second - first) / length
             slope[col + 3 : col + 6] = rigid3.rotate(state.rig_from_world[frame], away)
-    return float(np.sqrt(slope @ reduced.matrix @ slope)) / length
+    return float(np.sqrt(reduced.variance_of(slope))) / length
 
 
-def _posterior_covariance(optimum: Optimum) -> Posterior:
+def _posterior_covariance(optimum: Optimum, reduction: Reduction) -> Posterior:
     layout = optimum.layout
     eqs = likelihood(layout, optimum.state, optimum.priors)
-    reduced = reduced_covariance(layout, eqs)
+    reduced = reduced_covariance(layout, eqs, reduction)
     variance = optimum.sigma_px**2
-    border = variance * reduced.border(layout)
+    border = variance * reduced.border
     points = np.full((optimum.num_points, 3, 3), np.nan)
     points[optimum.used] = variance * point_covariances(layout, eqs, reduced)
     shared = np.full_like(border, np.nan)
@@ -132,13 +135,13 @@ def _posterior_covariance(optimum: Optimum) -> Posterior:
     covariance = Covariance(
         border=border,
         border_cols=optimum.columns,
-        frames=variance * reduced.frames(layout),
+        frames=variance * reduced.frames,
         points=points,
         cameras=tuple(cameras),
         determined=reduced.determined,
         scale_stddev=None if optimum.scale_held else optimum.sigma_px * scale,
     )
-    return Posterior(covariance, variance * reduced.navigation(layout))
+    return Posterior(covariance, variance * reduced.navigation)
 
 
 def predict_covariance(
@@ -184,11 +187,11 @@ def predict_covariance(
     reduced = reduced_covariance(layout, eqs)
     scale = noise_px * _scale_stddev(layout, state, reduced, outside.ends)
     variance = noise_px**2
-    border = variance * reduced.border(layout)
+    border = variance * reduced.border
     return Covariance(
         border=border,
         border_cols=columns,
-        frames=variance * reduced.frames(layout),
+        frames=variance * reduced.frames,
         points=variance * point_covariances(layout, eqs, reduced),
         cameras=tuple(
             _camera_covariance(
@@ -215,34 +218,40 @@ def _shared_errors(
 ) -> Array:
     """Cluster-robust covariance (B, B) of the border, priors included."""
     layout = optimum.layout
-    offset = layout.num_frame_cols
     covariance = clustered_covariance(
         layout, optimum.state.kernel_state(), eqs, reduced, _clusters(optimum)
     )
     # Residuals are smaller than errors by the share of fitted parameters.
     covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
     if optimum.priors is not None:
-        known = _prior_information(layout, optimum.state, optimum.priors)
-        reach = reduced.matrix[offset:]
-        covariance += optimum.sigma_px**2 * reach @ known @ reach.T
+        prior = _prior_covariance(layout, optimum.state, optimum.priors, reduced)
+        covariance += optimum.sigma_px**2 * prior
     return covariance[: layout.num_camera_cols, : layout.num_camera_cols]
 
 
-def _prior_information(layout: Layout, state: State, priors: Priors) -> Array:
-    """What the priors alone add to the reduced matrix (n, n).
+def _prior_covariance(
+    layout: Layout, state: State, priors: Priors, reduced: ReducedCovariance
+) -> Array:
+    """What the errors of the priors do to the border (B, B): S^-1 K S^-1, with K what
+    they alone add to the reduced matrix.
 
     A length's own variance is the noise of its column.
     """
     eqs = empty_normal_equations(layout)
     priors.add_to(eqs, state, layout)
-    offset, size = layout.num_frame_cols, layout.num_unknowns
-    matrix = np.zeros((offset + layout.num_border_cols,) * 2)
-    right = np.empty(len(matrix))
-    schur.fill_frames_and_border(layout, eqs, 0.0, matrix, right, offset)
-    matrix = np.tril(matrix) + np.tril(matrix, -1).T
-    matrix[size:, :size] = matrix[:size, size:] = 0.0
-    matrix[size:, size:] *= -1.0
-    return matrix
+    free = reduced.reduction.graph.frame
+    num_unknown = layout.num_border_cols - layout.num_lengths
+    border = eqs.border.copy()
+    border[num_unknown:] *= -1.0
+    border[num_unknown:, :num_unknown] = border[:num_unknown, num_unknown:] = 0.0
+    coupling = eqs.frames_border[free]
+    coupling[:, :, num_unknown:] = 0.0
+    by_frame, by_border = reduced.coupling, reduced.whole_border
+    own = np.einsum(
+        "fak,fab,fbm->km", by_frame, eqs.frames[free], by_frame, optimize=True
+    )
+    across = np.einsum("fak,fab->kb", by_frame, coupling) @ by_border
+    return own + across + across.T + by_border @ border @ by_border
 
 
 def _clusters(optimum: Optimum) -> IndexArray:

@@ -27,36 +27,52 @@ from uwsfm.solver.state import KernelState
 
 
 @kernel
-def _add_score(layout, eqs, p, col, torque_force, pull, border, camera, offset, score):
-    """Add J~^T r of one observation: its own part, minus what its point takes up."""
-    if col != HELD:
-        for a in range(6):
-            score[col + a] += torque_force[a]
-    for s in range(layout.free_start[camera], layout.free_start[camera + 1]):
-        k = layout.free_slot[s]
-        score[offset + layout.border_col[camera, k]] += border[k]
-    for c in range(layout.point_start[p], layout.point_start[p + 1]):
-        other = layout.frame_col[layout.cell_frame[c]]
-        if other == HELD:
-            continue
-        w = eqs.cells[c]
-        for a in range(6):
-            score[other + a] -= (
-                w[a, 0] * pull[0] + w[a, 1] * pull[1] + w[a, 2] * pull[2]
-            )
-    e = eqs.points_border[p]
-    for k in range(len(eqs.border_grad)):
-        score[offset + k] -= e[0, k] * pull[0] + e[1, k] * pull[1] + e[2, k] * pull[2]
+def _reach_of_point(layout, eqs, p, rows, out):
+    """What a pull (3,) on a point does to the border, (B, 3): S^-1 [W; E^T]."""
+    offset = rows.shape[1] - len(eqs.border_grad)
+    out[:] = 0.0
+    for b in range(len(out)):
+        for c in range(layout.point_start[p], layout.point_start[p + 1]):
+            col = layout.frame_col[layout.cell_frame[c]]
+            if col == HELD:
+                continue
+            for a in range(6):
+                for i in range(3):
+                    out[b, i] += rows[b, col + a] * eqs.cells[c, a, i]
+        for k in range(len(eqs.border_grad)):
+            for i in range(3):
+                out[b, i] += rows[b, offset + k] * eqs.points_border[p, i, k]
 
 
 @kernel
-def _scores(layout, state, eqs, inverses, cluster, offset, out):
-    """Sum J~^T r of each cluster into out (clusters, n); squared loss."""
+def _add_score(layout, rows, col, force, pull, grad, camera, of_point, score):
+    """Add S^-1 J~^T r of one observation: its own part, minus what its point takes."""
+    offset = rows.shape[1] - len(score)
+    for b in range(len(score)):
+        total = -(
+            of_point[b, 0] * pull[0]
+            + of_point[b, 1] * pull[1]
+            + of_point[b, 2] * pull[2]
+        )
+        if col != HELD:
+            for a in range(6):
+                total += rows[b, col + a] * force[a]
+        for s in range(layout.free_start[camera], layout.free_start[camera + 1]):
+            total += rows[b, offset + layout.free_col[s]] * grad[layout.free_slot[s]]
+        score[b] += total
+
+
+@kernel
+def _scores(layout, state, eqs, inverses, cluster, rows, out):
+    """Sum the border's part of S^-1 J~^T r of each cluster, (clusters, B); squared
+    loss. The frames' part would be as large as frames times clusters."""
     j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
     j_border = np.zeros((2, BORDER_SIZE))
     force, grad = np.empty(6), np.empty(BORDER_SIZE)
+    of_point, in_world = np.empty((len(rows), 3)), np.empty(3)
     for p in range(len(layout.point_start) - 1):
         inverse = inverses[p]
+        _reach_of_point(layout, eqs, p, rows, of_point)
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             f = layout.cell_frame[c]
             frame = state.frames[f]
@@ -71,23 +87,22 @@ def _scores(layout, state, eqs, inverses, cluster, offset, out):
                 force[0], force[1] = y * g[2] - z * g[1], z * g[0] - x * g[2]
                 force[2], force[3:] = x * g[1] - y * g[0], g
                 grad[:] = j_border[0] * rx + j_border[1] * ry
-                in_world = np.empty(3)
                 for a in range(3):
                     in_world[a] = (
                         frame[a] * g[0] + frame[4 + a] * g[1] + frame[8 + a] * g[2]
                     )
-                pull = inverse @ in_world
+                pull, col = inverse @ in_world, layout.frame_col[f]
+                score = out[cluster[i]]
                 _add_score(
                     layout,
-                    eqs,
-                    p,
-                    layout.frame_col[f],
+                    rows,
+                    col,
                     force,
                     pull,
                     grad,
                     layout.camera[i],
-                    offset,
-                    out[cluster[i]],
+                    of_point,
+                    score,
                 )
 
 
@@ -105,8 +120,7 @@ def clustered_covariance(
         reduced: inverse of the reduced system, unit noise.
         cluster: (N,) cluster of each sorted observation, counted from 0.
     """
-    scores = np.zeros((int(cluster.max()) + 1, len(reduced.matrix)))
-    offset = layout.num_frame_cols
-    _scores(layout, state, eqs, reduced.inverses, cluster, offset, scores)
-    half = reduced.matrix[offset:] @ scores.T
-    return half @ half.T
+    rows = reduced.border_rows
+    scores = np.zeros((int(cluster.max()) + 1, len(rows)))
+    _scores(layout, state, eqs, reduced.points, cluster, rows, scores)
+    return scores.T @ scores

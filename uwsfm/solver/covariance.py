@@ -8,102 +8,154 @@ import numpy as np
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver import schur
+from uwsfm.solver.block_graph import find_block
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import NormalEquations
-from uwsfm.solver.quasidefinite import inverse_of_lower
+from uwsfm.solver.reduced_factor import Inverse, inverse
+from uwsfm.solver.reduction import Reduction, analyse
+from uwsfm.solver.threads import chunk_bounds, num_threads, run_chunks
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReducedCovariance:
-    """Inverse of the reduced system (n, n), for unit noise."""
+    """What the inverse of the reduced system (n, n) tells, for unit noise.
 
-    matrix: Array
-    """(n, n) frames, then border; NaN everywhere if singular."""
+    Of frames that share a point, and of all of them with the border; NaN everywhere if
+    the system is singular.
+    """
+
+    reduction: Reduction
     determined: bool
-    inverses: Array
+    points: Array
     """(P, 3, 3) inverses of the point blocks that the elimination used."""
+    blocks: Array
+    """(number of blocks, 6, 6) of the free frames, in the pattern of the graph."""
+    coupling: Array
+    """(F, 6, B) of free frames and border."""
+    whole_border: Array
+    """(B, B), lengths included."""
+    found: Inverse | None
 
-    def border(self, layout: Layout) -> Array:
-        """(B, B) block of rig and ports, marginal over poses and points."""
-        inside = slice(layout.num_frame_cols, None)
-        return self.matrix[inside, inside][: layout.num_camera_cols][
-            :, : layout.num_camera_cols
-        ]
+    @property
+    def layout(self) -> Layout:
+        return self.reduction.layout
 
-    def navigation(self, layout: Layout) -> Array:
+    @property
+    def border(self) -> Array:
+        """(C, C) block of rig and ports, marginal over poses and points."""
+        cameras = slice(self.layout.num_camera_cols)
+        return self.whole_border[cameras, cameras]
+
+    @property
+    def navigation(self) -> Array:
         """(6, 6) block of nav_from_world [rotation, translation], left tangent."""
-        end = layout.num_unknowns
-        inside = slice(end - layout.num_nav_cols, end)
-        return self.matrix[inside, inside]
+        first = self.layout.num_camera_cols
+        inside = slice(first, first + self.layout.num_nav_cols)
+        return self.whole_border[inside, inside]
 
-    def frames(self, layout: Layout) -> Array:
+    @property
+    def border_rows(self) -> Array:
+        """(B, n) rows of the border."""
+        size = len(self.whole_border)
+        frames = self.coupling.reshape(self.layout.num_frame_cols, size).T
+        return np.concatenate([frames, self.whole_border], axis=1)
+
+    @property
+    def frames(self) -> Array:
         """(F, 6, 6) blocks of the poses [rotation, translation]; zero if held."""
-        blocks = np.zeros((len(layout.frame_col), 6, 6))
-        for f, col in enumerate(layout.frame_col):
-            if col != HELD:
-                blocks[f] = self.matrix[col : col + 6, col : col + 6]
+        graph = self.reduction.graph
+        blocks = np.zeros((len(self.layout.frame_col), 6, 6))
+        blocks[graph.frame] = self.blocks[graph.row_start[1:] - 1]
         return blocks
 
+    def variance_of(self, slope: Array) -> float:
+        """Variance of what changes by slope (n,) times the unknowns; NaN if singular.
 
-def reduced_covariance(layout: Layout, eqs: NormalEquations) -> ReducedCovariance:
+        Of any unknowns, whether they share a point or not.
+        """
+        if self.found is None:
+            return math.nan
+        return float(slope @ self.found.times(slope[:, None])[:, 0])
+
+
+def reduced_covariance(
+    layout: Layout, eqs: NormalEquations, reduction: Reduction | None = None
+) -> ReducedCovariance:
     """Invert the undamped reduced system.
 
     The observations' noise is taken as 1 px: multiply by the noise variance.
+
+    Args:
+        layout, eqs: the problem at its optimum.
+        reduction: how its reduced system is solved, if that is known.
     """
-    matrix, _, inverses = schur.reduced_system(layout, eqs, 0.0)
-    inverse = inverse_of_lower(matrix, layout.num_lengths)
-    if inverse is None:
-        return ReducedCovariance(
-            matrix=np.full_like(matrix, np.nan), determined=False, inverses=inverses
+    reduction = reduction or analyse(layout)
+    system = schur.reduced_system(layout, reduction.graph, eqs, 0.0)
+    found = inverse(reduction, system, layout.num_lengths)
+    if found is None:
+        blocks, coupling, border = (
+            np.full_like(part, np.nan)
+            for part in (system.blocks, system.coupling, system.border)
         )
-    return ReducedCovariance(matrix=inverse, determined=True, inverses=inverses)
+    else:
+        blocks, coupling, border = found.blocks, found.coupling, found.border
+    return ReducedCovariance(
+        reduction=reduction,
+        determined=found is not None,
+        points=system.inverses,
+        blocks=blocks,
+        coupling=np.ascontiguousarray(coupling),
+        whole_border=np.ascontiguousarray(border),
+        found=found,
+    )
 
 
 @kernel
-def _coupling_of_point(layout, eqs, p, offset, cols, coupling):
-    """Rows of a point's coupling C = [W of the free frames; E^T]; their number."""
-    rows = 0
-    for c in range(layout.point_start[p], layout.point_start[p + 1]):
-        col = layout.frame_col[layout.cell_frame[c]]
-        if col == HELD:
-            continue
-        for a in range(6):
-            cols[rows] = col + a
-            coupling[rows] = eqs.cells[c, a]
-            rows += 1
-    for k in range(len(eqs.border_grad)):
-        cols[rows] = offset + k
-        coupling[rows] = eqs.points_border[p, :, k]
-        rows += 1
-    return rows
+def _add_products(left, middle, right, twice, out):
+    """out (3, 3) += L^T M R, or L^T M R + (L^T M R)^T; L (a, 3), M (a, b), R (b, 3)."""
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for a in range(middle.shape[0]):
+                for b in range(middle.shape[1]):
+                    total += left[a, i] * middle[a, b] * right[b, j]
+            out[i, j] += total
+            if twice:
+                out[j, i] += total
 
 
 @kernel
-def _point_covariances(layout, eqs, matrix, offset, out):
+def _point_covariances(point_start, graph, eqs, known, first, last, out):
     """V^-1 + (C V^-1)^T S^-1 (C V^-1) of each point; NaN where V is singular."""
-    num_border = len(eqs.border_grad)
-    inverse = np.empty((3, 3))
-    for p in range(len(layout.point_start) - 1):
-        if not schur.invert_damped(eqs.points[p], 0.0, inverse):
+    blocks, coupling, border = known
+    cells, points, points_border = eqs.cells, eqs.points, eqs.points_border
+    row_start, row_other, cell_row = graph.row_start, graph.row_other, graph.cell_row
+    largest = np.diff(point_start).max()
+    reach = np.empty((largest, 6, 3))
+    inverse_block = np.empty((3, 3))
+    for p in range(first, last):
+        if not schur.invert_damped(points[p], 0.0, inverse_block):
             out[p] = math.nan
             continue
-        cells = layout.point_start[p + 1] - layout.point_start[p]
-        cols = np.empty(6 * cells + num_border, dtype=np.int64)
-        coupling = np.empty((6 * cells + num_border, 3))
-        rows = _coupling_of_point(layout, eqs, p, offset, cols, coupling)
-        reach = coupling[:rows] @ inverse
-        out[p] = inverse
-        for i in range(rows):
-            s0, s1, s2 = 0.0, 0.0, 0.0
-            for j in range(rows):
-                m = matrix[cols[i], cols[j]]
-                s0 += m * reach[j, 0]
-                s1 += m * reach[j, 1]
-                s2 += m * reach[j, 2]
-            for a in range(3):
-                out[p, a, 0] += reach[i, a] * s0
-                out[p, a, 1] += reach[i, a] * s1
-                out[p, a, 2] += reach[i, a] * s2
+        out[p] = inverse_block
+        sideways = np.ascontiguousarray(points_border[p].T) @ inverse_block
+        _add_products(sideways, border, sideways, False, out[p])
+        start = point_start[p]
+        for c in range(start, point_start[p + 1]):
+            i = cell_row[c]
+            if i == HELD:
+                continue
+            reach[c - start] = cells[c] @ inverse_block
+            _add_products(reach[c - start], coupling[i], sideways, True, out[p])
+            s = row_start[i]
+            for other in range(start, c + 1):
+                j = cell_row[other]
+                if j == HELD:
+                    continue
+                s = find_block(row_start, row_other, i, j, s)
+                _add_products(
+                    reach[other - start], blocks[s], reach[c - start], j != i, out[p]
+                )
 
 
 def point_covariances(
@@ -114,5 +166,13 @@ def point_covariances(
     NaN for points that the observations do not determine.
     """
     out = np.empty_like(eqs.points)
-    _point_covariances(layout, eqs, reduced.matrix, layout.num_frame_cols, out)
+    known = (reduced.blocks, reduced.coupling, reduced.whole_border)
+    bounds = chunk_bounds(layout.point_start, num_threads())
+
+    def fill(chunk: int) -> None:
+        first, last = bounds[chunk], bounds[chunk + 1]
+        graph = reduced.reduction.graph
+        _point_covariances(layout.point_start, graph, eqs, known, first, last, out)
+
+    run_chunks(fill, len(bounds) - 1)
     return out

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -22,8 +23,11 @@ from uwsfm.solver.normal_equations import (
     squared_errors,
     total_cost,
 )
-from uwsfm.solver.quasidefinite import solve_lower
+from uwsfm.solver.reduced_factor import solve
+from uwsfm.solver.reduction import Reduction, analyse
+from uwsfm.solver.schur import ReducedSystem
 from uwsfm.solver.state import State
+from uwsfm.solver.threads import num_threads
 
 # Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
 SINGLE_BLAS_BELOW = 1500
@@ -117,6 +121,12 @@ class Problem:
         self._loss = LOSS_CODES[options.loss]
         self._scale = options.loss_scale_px
         self._eqs = empty_normal_equations(layout)
+        self._system: ReducedSystem | None = None
+
+    @cached_property
+    def reduction(self) -> Reduction:
+        """How the reduced systems are solved."""
+        return analyse(self.layout)
 
     def cost(self, state: State) -> tuple[float, int]:
         """Robust cost, priors included, and the number of valid errors."""
@@ -145,13 +155,15 @@ class Problem:
 
     def step(self, eqs: NormalEquations, damping: float) -> tuple[Array, Array] | None:
         """Steps of the reduced system (n,) and the points (P, 3); None if singular."""
-        matrix, right, inverses = schur.reduced_system(self.layout, eqs, damping)
-        step = solve_lower(matrix, right, self.layout.num_lengths)
+        self._system = system = schur.reduced_system(
+            self.layout, self.reduction.graph, eqs, damping, self._system
+        )
+        step = solve(self.reduction, system, self.layout.num_lengths)
         if step is None:
             return None
-        points_step = np.empty_like(eqs.points_grad)
-        offset = self.layout.num_frame_cols
-        schur.substitute_back(self.layout, eqs, inverses, step, offset, points_step)
+        points_step = schur.substitute_back(
+            self.layout, self.reduction.graph, eqs, system.inverses, step
+        )
         return step, points_step
 
     def predicted_decrease(
@@ -185,10 +197,10 @@ class Problem:
 Report = Callable[[int, float], None]
 
 
-def suitable_blas(layout: Layout) -> threadpool_limits:
+def suitable_blas(reduction: Reduction) -> threadpool_limits:
     """A context with as many BLAS threads as a reduced system is worth."""
-    size = layout.num_frame_cols + layout.num_border_cols
-    return threadpool_limits(1 if size < SINGLE_BLAS_BELOW else None, user_api="blas")
+    small = reduction.largest_matrix < SINGLE_BLAS_BELOW
+    return threadpool_limits(1 if small else num_threads(), user_api="blas")
 
 
 def minimize(
@@ -206,9 +218,9 @@ def minimize(
     Raises:
         UwsfmError: the start is so wrong that nothing can be projected.
     """
-    with suitable_blas(layout):
-        error = error_model(options.error, layout, start)
-        problem = Problem(layout, error, options, priors)
+    error = error_model(options.error, layout, start)
+    problem = Problem(layout, error, options, priors)
+    with suitable_blas(problem.reduction):
         return _iterate(problem, start, options, report)
 
 

@@ -24,11 +24,11 @@ SINGULAR = 1e-13
 
 
 def solve_lower(matrix: Array, right: Array, num_lengths: int = 0) -> Array | None:
-    """Solution (n,) of a reduced system; None if it is singular.
+    """Solution (n,) or (n, r) of a reduced system; None if it is singular.
 
     Args:
         matrix: (n, n), its lower triangle; lost.
-        right: (n,)
+        right: (n,) or (n, r)
         num_lengths: how many of the last columns are lengths.
     """
     unknowns, reach, stiff = without_forces(matrix, num_lengths)
@@ -73,11 +73,15 @@ def without_forces(matrix: Array, num_lengths: int) -> tuple[Array, Array, Array
     split = len(matrix) - num_lengths
     if not num_lengths:
         return matrix, np.empty((split, 0)), np.empty((0, 0))
-    lower = -matrix[split:, split:]
-    stiff = np.tril(lower) + np.tril(lower, -1).T
+    stiff = symmetric(-matrix[split:, split:])
     coupling = matrix[split:, :split].T
     reach = np.linalg.solve(stiff, coupling.T).T
     return matrix[:split, :split] + reach @ coupling.T, reach, stiff
+
+
+def symmetric(lower: Array) -> Array:
+    """A matrix (n, n) from its lower triangle."""
+    return np.tril(lower) + np.tril(lower, -1).T
 
 
 def _inverse_of_positive(matrix: Array) -> Array | None:

@@ -1,15 +1,48 @@
-"""Schur complement: eliminate the points, solve frames and border, substitute back."""
+"""Schur complement: eliminate the points, and substitute them back.
+
+What is left are frames and border. Frames meet only where they share points: their part
+is kept as 6x6 blocks in the pattern of a `BlockGraph`. A thread sums whole rows of it,
+and every sum runs over the points in their order: the digits do not depend on how many
+threads there are.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.solver.block_graph import BlockGraph, find_block
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import MIN_DIAGONAL, NormalEquations
+from uwsfm.solver.threads import chunk_bounds, num_threads, run_chunks
 
 # Damping of a point that its rays do not fix (seen twice in one image, or at infinity).
 # Held instead of free it would be a landmark, and promise what the data do not.
 LOOSE = 1e-8
+
+POINTS_AT_ONCE = 8192
+"""Whose part of the border is summed apart: the same for any number of threads."""
+
+CELLS_PER_THREAD = 10_000
+"""Fewer cost less than a thread's start, 50 us."""
+
+
+class ReducedSystem(NamedTuple):
+    """Frames (F free ones) and border (B columns), symmetric, after the points."""
+
+    blocks: Array
+    """(number of blocks, 6, 6): of row i and frame j <= i, rows of j, columns of i."""
+    coupling: Array
+    """(F, 6, B) of frames and border."""
+    border: Array
+    """(B, B), lower triangle."""
+    right_frames: Array
+    """(F, 6)"""
+    right_border: Array
+    """(B,)"""
+    inverses: Array
+    """(P, 3, 3): inverses of the damped point blocks."""
 
 
 @kernel
@@ -33,140 +66,260 @@ def invert_damped(block, damping, inverse):
 
 
 @kernel
-def fill_frames_and_border(layout, eqs, damping, matrix, right, offset):
-    """Copy the damped diagonal blocks and the border, before any elimination."""
-    num_border = len(eqs.border_grad)
-    for f in range(len(layout.frame_col)):
-        col = layout.frame_col[f]
-        if col == HELD:
-            continue
-        for a in range(6):
-            right[col + a] = -eqs.frames_grad[f, a]
-            for b in range(6):
-                matrix[col + a, col + b] = eqs.frames[f, a, b]
-            matrix[col + a, col + a] += damping * max(eqs.frames[f, a, a], MIN_DIAGONAL)
-            for k in range(num_border):
-                matrix[offset + k, col + a] = eqs.frames_border[f, a, k]
-    for k in range(num_border):
-        right[offset + k] = -eqs.border_grad[k]
-        for m in range(num_border):
-            matrix[offset + k, offset + m] = eqs.border[k, m]
-        if k < num_border - layout.num_lengths:
-            stiff = max(eqs.border[k, k], MIN_DIAGONAL)
-            matrix[offset + k, offset + k] += damping * stiff
-
-
-@kernel
-def _sweep_border(eqs, p, inverse, offset, swept, matrix, right):
-    """Take one point out of the border: swept = E^T V^-1, border -= swept E."""
-    g, e = eqs.points_grad[p], eqs.points_border[p]
-    for k in range(len(swept)):
-        row = offset + k
-        for b in range(3):
-            swept[k, b] = (
-                e[0, k] * inverse[0, b]
-                + e[1, k] * inverse[1, b]
-                + e[2, k] * inverse[2, b]
-            )
-        s0, s1, s2 = swept[k, 0], swept[k, 1], swept[k, 2]
-        right[row] += s0 * g[0] + s1 * g[1] + s2 * g[2]
-        for m in range(k + 1):
-            matrix[row, offset + m] -= s0 * e[0, m] + s1 * e[1, m] + s2 * e[2, m]
-
-
-@kernel
-def _fold_cell(cell, inverse, grad, col, folded, right):
-    """folded = W V^-1 of one cell, and its part of the right side."""
-    for a in range(6):
-        for b in range(3):
-            folded[a, b] = (
-                cell[a, 0] * inverse[0, b]
-                + cell[a, 1] * inverse[1, b]
-                + cell[a, 2] * inverse[2, b]
-            )
-        right[col + a] += (
-            folded[a, 0] * grad[0] + folded[a, 1] * grad[1] + folded[a, 2] * grad[2]
-        )
-
-
-@kernel
-def _subtract_product(left, right, row, col, matrix):
-    """matrix[row:, col:] -= left right^T, for left (n, 3) and right (m, 3)."""
-    for a in range(len(left)):
-        l0, l1, l2 = left[a, 0], left[a, 1], left[a, 2]
-        for b in range(len(right)):
-            matrix[row + a, col + b] -= (
-                l0 * right[b, 0] + l1 * right[b, 1] + l2 * right[b, 2]
-            )
-
-
-@kernel
-def eliminate_points(layout, eqs, damping, offset, inverses, matrix, right):
-    """Build the reduced system (lower triangle) of frames, then border.
+def invert_points(eqs, damping, first, last, inverses, border, right):
+    """Invert the damped blocks of some points, and take them out of the border.
 
     Args:
-        layout, eqs: the linearised problem.
-        damping: Marquardt's lambda.
-        offset: number of frame columns.
-        inverses: (P, 3, 3), written: inverses of the damped point blocks.
-        matrix, right: (n, n) and (n,), written.
+        eqs, damping: the linearised problem, Marquardt's lambda.
+        first, last: the points.
+        inverses: (P, 3, 3), written.
+        border, right: (B, B; lower triangle) and (B,), where the sums are subtracted.
     """
-    matrix[:], right[:], inverses[:] = 0.0, 0.0, 0.0
-    fill_frames_and_border(layout, eqs, damping, matrix, right, offset)
-    folded = np.empty((6, 3))
-    swept = np.empty((len(eqs.border_grad), 3))
-    for p in range(len(layout.point_start) - 1):
+    swept = np.empty((len(right), 3))
+    points, points_grad, e = eqs.points, eqs.points_grad, eqs.points_border
+    for p in range(first, last):
         inverse = inverses[p]
-        if not invert_damped(eqs.points[p], damping, inverse):
-            invert_damped(eqs.points[p], LOOSE, inverse)
-        _sweep_border(eqs, p, inverse, offset, swept, matrix, right)
-        first, last = layout.point_start[p], layout.point_start[p + 1]
-        for c in range(first, last):
-            col = layout.frame_col[layout.cell_frame[c]]
-            if col == HELD:
-                continue
-            _fold_cell(eqs.cells[c], inverse, eqs.points_grad[p], col, folded, right)
-            _subtract_product(swept, eqs.cells[c], offset, col, matrix)
-            for other in range(first, c + 1):
-                col2 = layout.frame_col[layout.cell_frame[other]]
-                if col2 != HELD:
-                    _subtract_product(folded, eqs.cells[other], col, col2, matrix)
+        inverse[:] = 0.0
+        if not invert_damped(points[p], damping, inverse):
+            invert_damped(points[p], LOOSE, inverse)
+        g0, g1, g2 = points_grad[p, 0], points_grad[p, 1], points_grad[p, 2]
+        for k in range(len(right)):
+            for b in range(3):
+                swept[k, b] = (
+                    e[p, 0, k] * inverse[0, b]
+                    + e[p, 1, k] * inverse[1, b]
+                    + e[p, 2, k] * inverse[2, b]
+                )
+            s0, s1, s2 = swept[k, 0], swept[k, 1], swept[k, 2]
+            right[k] += s0 * g0 + s1 * g1 + s2 * g2
+            for m in range(k + 1):
+                border[k, m] -= s0 * e[p, 0, m] + s1 * e[p, 1, m] + s2 * e[p, 2, m]
 
 
 @kernel
-def substitute_back(layout, eqs, inverses, step, offset, points_step):
-    """Steps of the points (P, 3) from the step of frames and border (n,)."""
-    num_border = len(eqs.border_grad)
-    for p in range(len(layout.point_start) - 1):
-        g = eqs.points_grad[p]
+def _fold_cell(
+    cells, inverses, points_grad, points_border, c, p, i, right, coupling, folded
+):
+    """W V^-1 (6, 3) of one cell, and its part of right side and coupling of row i."""
+    v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
+    v11, v12, v22 = inverses[p, 1, 1], inverses[p, 1, 2], inverses[p, 2, 2]
+    g0, g1, g2 = points_grad[p, 0], points_grad[p, 1], points_grad[p, 2]
+    for a in range(6):
+        w0, w1, w2 = cells[c, a, 0], cells[c, a, 1], cells[c, a, 2]
+        f0 = w0 * v00 + w1 * v01 + w2 * v02
+        f1 = w0 * v01 + w1 * v11 + w2 * v12
+        f2 = w0 * v02 + w1 * v12 + w2 * v22
+        folded[a, 0], folded[a, 1], folded[a, 2] = f0, f1, f2
+        right[i, a] += f0 * g0 + f1 * g1 + f2 * g2
+        for k in range(coupling.shape[2]):
+            coupling[i, a, k] -= (
+                f0 * points_border[p, 0, k]
+                + f1 * points_border[p, 1, k]
+                + f2 * points_border[p, 2, k]
+            )
+
+
+@kernel
+def _subtract_products(
+    row_start, row_other, cell_row, first, last, i, cells, folded, blocks
+):
+    """Blocks of row i -= W' (W V^-1)^T for the cells W' of a point up to its own."""
+    # Six lanes: all that a line of the block needs is loaded before it is stored.
+    f00, f10, f20 = folded[0, 0], folded[1, 0], folded[2, 0]
+    f30, f40, f50 = folded[3, 0], folded[4, 0], folded[5, 0]
+    f01, f11, f21 = folded[0, 1], folded[1, 1], folded[2, 1]
+    f31, f41, f51 = folded[3, 1], folded[4, 1], folded[5, 1]
+    f02, f12, f22 = folded[0, 2], folded[1, 2], folded[2, 2]
+    f32, f42, f52 = folded[3, 2], folded[4, 2], folded[5, 2]
+    s = row_start[i]
+    for c in range(first, last):
+        j = cell_row[c]
+        if j == HELD:
+            continue
+        s = find_block(row_start, row_other, i, j, s)
+        for b in range(6):
+            w0, w1, w2 = cells[c, b, 0], cells[c, b, 1], cells[c, b, 2]
+            b0 = blocks[s, b, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
+            b1 = blocks[s, b, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
+            b2 = blocks[s, b, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
+            b3 = blocks[s, b, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
+            b4 = blocks[s, b, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
+            b5 = blocks[s, b, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
+            blocks[s, b, 0], blocks[s, b, 1], blocks[s, b, 2] = b0, b1, b2
+            blocks[s, b, 3], blocks[s, b, 4], blocks[s, b, 5] = b3, b4, b5
+
+
+@kernel
+def _fill_rows(graph, eqs, damping, first, last, system):
+    """Rows as they are before any elimination."""
+    blocks, coupling, right = system.blocks, system.coupling, system.right_frames
+    blocks[graph.row_start[first] : graph.row_start[last]] = 0.0
+    for i in range(first, last):
+        f, own = graph.frame[i], graph.row_start[i + 1] - 1
+        for a in range(6):
+            right[i, a] = -eqs.frames_grad[f, a]
+            for b in range(6):
+                blocks[own, a, b] = eqs.frames[f, a, b]
+            blocks[own, a, a] += damping * max(eqs.frames[f, a, a], MIN_DIAGONAL)
+            for k in range(coupling.shape[2]):
+                coupling[i, a, k] = eqs.frames_border[f, a, k]
+
+
+@kernel
+def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
+    """Sum the rows of some frames.
+
+    Args:
+        point_start, graph, eqs: the linearised problem.
+        damping: Marquardt's lambda.
+        first, last: the rows.
+        system: its inverses given; blocks, coupling and right side of the rows written.
+    """
+    blocks, coupling, right = system.blocks, system.coupling, system.right_frames
+    _fill_rows(graph, eqs, damping, first, last, system)
+    # Named once, out of the loop: each look into a tuple of arrays counts references.
+    row_start, row_other, cell_row = graph.row_start, graph.row_other, graph.cell_row
+    cells, grads, borders = eqs.cells, eqs.points_grad, eqs.points_border
+    inverses, folded = system.inverses, np.empty((6, 3))
+    for p in graph.point_order:
+        start = point_start[p]
+        for c in range(start, point_start[p + 1]):
+            i = cell_row[c]
+            if first <= i < last:
+                _fold_cell(
+                    cells, inverses, grads, borders, c, p, i, right, coupling, folded
+                )
+                _subtract_products(
+                    row_start,
+                    row_other,
+                    cell_row,
+                    start,
+                    c + 1,
+                    i,
+                    cells,
+                    folded,
+                    blocks,
+                )
+
+
+@kernel
+def substitute_points(
+    point_start, graph, eqs, inverses, frames_step, border_step, first, last, out
+):
+    """Steps (P, 3) of some points from those of the frames (F, 6) and border (B,)."""
+    for p in range(first, last):
+        g, e = eqs.points_grad[p], eqs.points_border[p]
         b0, b1, b2 = -g[0], -g[1], -g[2]
-        for k in range(num_border):
-            s = step[offset + k]
-            b0 -= eqs.points_border[p, 0, k] * s
-            b1 -= eqs.points_border[p, 1, k] * s
-            b2 -= eqs.points_border[p, 2, k] * s
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            col = layout.frame_col[layout.cell_frame[c]]
-            if col == HELD:
+        for k in range(len(border_step)):
+            s = border_step[k]
+            b0 -= e[0, k] * s
+            b1 -= e[1, k] * s
+            b2 -= e[2, k] * s
+        for c in range(point_start[p], point_start[p + 1]):
+            i = graph.cell_row[c]
+            if i == HELD:
                 continue
             for a in range(6):
-                s = step[col + a]
+                s = frames_step[i, a]
                 b0 -= eqs.cells[c, a, 0] * s
                 b1 -= eqs.cells[c, a, 1] * s
                 b2 -= eqs.cells[c, a, 2] * s
         v = inverses[p]
-        points_step[p, 0] = v[0, 0] * b0 + v[0, 1] * b1 + v[0, 2] * b2
-        points_step[p, 1] = v[1, 0] * b0 + v[1, 1] * b1 + v[1, 2] * b2
-        points_step[p, 2] = v[2, 0] * b0 + v[2, 1] * b1 + v[2, 2] * b2
+        out[p, 0] = v[0, 0] * b0 + v[0, 1] * b1 + v[0, 2] * b2
+        out[p, 1] = v[1, 0] * b0 + v[1, 1] * b1 + v[1, 2] * b2
+        out[p, 2] = v[2, 0] * b0 + v[2, 1] * b1 + v[2, 2] * b2
+
+
+def damped_border(layout: Layout, eqs: NormalEquations, damping: float) -> Array:
+    """The border's own block (B, B); what is known of lengths is not damped."""
+    border = eqs.border.copy()
+    free = np.arange(layout.num_border_cols - layout.num_lengths)
+    stiff = np.maximum(np.diagonal(border)[free], MIN_DIAGONAL)
+    border[free, free] += damping * stiff
+    return border
 
 
 def reduced_system(
-    layout: Layout, eqs: NormalEquations, damping: float
-) -> tuple[Array, Array, Array]:
-    """The reduced matrix (n, n; lower triangle), right side (n,), point inverses."""
+    layout: Layout,
+    graph: BlockGraph,
+    eqs: NormalEquations,
+    damping: float,
+    storage: ReducedSystem | None = None,
+) -> ReducedSystem:
+    """Eliminate the points.
+
+    Args:
+        layout, graph, eqs: the linearised problem.
+        damping: Marquardt's lambda.
+        storage: an earlier result, whose arrays are used again.
+    """
+    system = storage or empty_system(layout, graph)
+    num_points, num_border = len(eqs.points), layout.num_border_cols
+    num_chunks = max(1, -(-num_points // POINTS_AT_ONCE))
+    borders = np.zeros((num_chunks, num_border, num_border))
+    rights = np.zeros((num_chunks, num_border))
+    borders[0], rights[0] = damped_border(layout, eqs, damping), -eqs.border_grad
+
+    def invert(chunk: int) -> None:
+        first = chunk * POINTS_AT_ONCE
+        last = min(first + POINTS_AT_ONCE, num_points)
+        invert_points(
+            eqs, damping, first, last, system.inverses, borders[chunk], rights[chunk]
+        )
+
+    run_chunks(invert, num_chunks)
+    system.border[...], system.right_border[...] = borders.sum(0), rights.sum(0)
+    rows = chunk_bounds(graph.work_start, _num_chunks(layout))
+
+    def eliminate(chunk: int) -> None:
+        first, last = rows[chunk], rows[chunk + 1]
+        eliminate_rows(layout.point_start, graph, eqs, damping, first, last, system)
+
+    run_chunks(eliminate, len(rows) - 1)
+    return system
+
+
+def empty_system(layout: Layout, graph: BlockGraph) -> ReducedSystem:
+    num_border = layout.num_border_cols
+    return ReducedSystem(
+        blocks=np.empty((graph.num_blocks, 6, 6)),
+        coupling=np.empty((graph.num_frames, 6, num_border)),
+        border=np.empty((num_border, num_border)),
+        right_frames=np.empty((graph.num_frames, 6)),
+        right_border=np.empty(num_border),
+        inverses=np.empty((len(layout.point_start) - 1, 3, 3)),
+    )
+
+
+def substitute_back(
+    layout: Layout,
+    graph: BlockGraph,
+    eqs: NormalEquations,
+    inverses: Array,
+    step: Array,
+) -> Array:
+    """Steps of the points (P, 3) from the step of frames and border (n,)."""
     offset = layout.num_frame_cols
-    size = offset + layout.num_border_cols
-    matrix, right = np.empty((size, size)), np.empty(size)
-    inverses = np.empty_like(eqs.points)
-    eliminate_points(layout, eqs, damping, offset, inverses, matrix, right)
-    return matrix, right, inverses
+    frames_step, border_step = step[:offset].reshape(-1, 6), step[offset:]
+    points_step = np.empty_like(eqs.points_grad)
+    points = chunk_bounds(layout.point_start, _num_chunks(layout))
+
+    def substitute(chunk: int) -> None:
+        substitute_points(
+            layout.point_start,
+            graph,
+            eqs,
+            inverses,
+            frames_step,
+            border_step,
+            points[chunk],
+            points[chunk + 1],
+            points_step,
+        )
+
+    run_chunks(substitute, len(points) - 1)
+    return points_step
+
+
+def _num_chunks(layout: Layout) -> int:
+    return max(1, min(num_threads(), len(layout.cell_frame) // CELLS_PER_THREAD))

@@ -1,0 +1,229 @@
+"""Dense, banded and sparse reduced systems: one answer, whatever way leads to it."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwsfm import CalibrateOptions
+from uwsfm.calibration.uncertainty import likelihood
+from uwsfm.models.port import NoPort
+from uwsfm.simulate import Perturbation, SurveySpec, perturbed, simulate_survey
+from uwsfm.solver import reduced_factor as factors
+from uwsfm.solver import schur, threads
+from uwsfm.solver.block_graph import build_graph
+from uwsfm.solver.covariance import point_covariances, reduced_covariance
+from uwsfm.solver.layout import HELD, build_layout
+from uwsfm.solver.levenberg_marquardt import (
+    LevenbergMarquardtOptions,
+    Priors,
+    minimize,
+)
+from uwsfm.solver.reduction import BANDED, DENSE, SPARSE, analyse
+from uwsfm.solver.state import State
+from uwsfm.solver.terms import LengthTerm, PositionTerm, centers
+
+SPEC = SurveySpec(num_frames=48, num_points=900, detection_rate=0.5)
+KINDS = (DENSE, BANDED, SPARSE)
+
+
+@pytest.fixture(scope="module")
+def survey():
+    return simulate_survey(SPEC)
+
+
+def layout_of(scene, held=(0,), **known):
+    columns = CalibrateOptions().border_columns(scene.cameras, np.zeros(2, dtype=bool))
+    held_frames = np.zeros(scene.num_frames, dtype=bool)
+    held_frames[list(held)] = True
+    return build_layout(scene, columns, held_frames, **known)
+
+
+def known_outside(scene):
+    """Two lengths between points, one between frames; positions of some frames."""
+    state = State.from_scene(scene)
+    where = centers(scene.rig_from_world)
+
+    def lengths(ends, places, first, of_frames):
+        ends = np.array(ends)
+        between = np.linalg.norm(places[ends[:, 0]] - places[ends[:, 1]], axis=1)
+        return LengthTerm(
+            ends=ends,
+            lengths=1.01 * between,
+            variances=np.full(len(ends), 1e-4),
+            of_frames=of_frames,
+            first=first,
+        )
+
+    seen = np.arange(0, scene.num_frames, 5)
+    positions = PositionTerm(
+        frames=seen,
+        positions=where[seen] + 0.01,
+        roots=np.tile(10.0 * np.eye(3), (len(seen), 1, 1)),
+        lever_arm=np.array([0.1, 0.0, 0.2]),
+        sigma_px=0.5,
+        loss_scale=None,
+        start=state.nav_from_world,
+    )
+    terms = (
+        lengths([(0, 1), (5, 800)], scene.points, 0, False),
+        lengths([(3, 40)], where, 2, True),
+        positions,
+    )
+    weights = np.zeros(layout_of(scene).border_col.shape)
+    return Priors(reference=state, weights=weights, terms=terms)
+
+
+def problems(scene):
+    """Layouts and priors: plain, with frames held, with everything from outside."""
+    yield layout_of(scene), None
+    yield layout_of(scene, held=(0, 11, 30)), None
+    outside = layout_of(scene, navigation=True, num_lengths=3)
+    yield outside, known_outside(scene)
+
+
+def test_every_way_leads_to_the_same_step(survey):
+    scene = perturbed(survey.scene, Perturbation(rotation_stddev_deg=0.1))
+    state = State.from_scene(scene)
+    for layout, priors in problems(scene):
+        eqs = likelihood(layout, state, priors)
+        # Relative to the step. The condition is what limits both sides: 1e8 at first.
+        for damping, tolerance in ((1e-6, 1e-8), (1e-2, 1e-10)):
+            steps = []
+            for kind in KINDS:
+                reduction = analyse(layout, kind)
+                system = schur.reduced_system(layout, reduction.graph, eqs, damping)
+                matrix = factors.dense_matrix(reduction, system)
+                steps.append(factors.solve(reduction, system, layout.num_lengths))
+            scale = np.sqrt(np.abs(np.diag(matrix)))  # each unknown's own unit
+            for step in steps[1:]:
+                error = np.linalg.norm(scale * (step - steps[0]))
+                assert error < tolerance * np.linalg.norm(scale * steps[0])
+
+
+def test_every_way_leads_to_the_same_covariance(survey):
+    state = State.from_scene(survey.truth)
+    for layout, priors in problems(survey.truth):
+        eqs = likelihood(layout, state, priors)
+        found = [reduced_covariance(layout, eqs, analyse(layout, k)) for k in KINDS]
+        # Far apart: no point is seen from both.
+        slope = np.zeros(layout.num_frame_cols + layout.num_border_cols)
+        slope[[3, 10, -7]] = 1.0, -1.0, 0.5
+        points = [point_covariances(layout, eqs, one) for one in found]
+        dense = found[0]
+        assert all(one.determined for one in found)
+        variance = dense.variance_of(slope)
+        for one, own in zip(found[1:], points[1:], strict=True):
+            assert one.variance_of(slope) == pytest.approx(variance, rel=1e-6)
+            for name in ("blocks", "coupling", "whole_border", "navigation", "frames"):
+                expected = getattr(dense, name)
+                error = np.abs(getattr(one, name) - expected)
+                # The condition of the scaled matrix is 1e9, 1e-16 of it.
+                assert error.max(initial=0.0) < 1e-6 * np.abs(expected).max(
+                    initial=1e-9
+                )
+            relative = np.abs(own - points[0]).max(axis=(1, 2))
+            relative /= np.trace(points[0], axis1=1, axis2=2)
+            assert np.nanmax(relative) < 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_the_data_leave_open_is_found_by_every_way(survey, kind):
+    """No frame held: the place of the world is open."""
+    state = State.from_scene(survey.truth)
+    for held, determined in (((), False), ((0,), True)):
+        layout = layout_of(survey.truth, held)
+        reduction = analyse(layout, kind)
+        reduced = reduced_covariance(layout, likelihood(layout, state, None), reduction)
+        assert reduced.determined is determined
+        assert np.isnan(reduced.border).all() != determined
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scale_that_only_a_length_tells_is_found_by_every_way(survey, kind):
+    """One camera in air: its frames alone are singular, the length joins them later."""
+    scene, _ = survey.truth.select(survey.truth.camera_idx == 0)
+    counts = np.bincount(scene.point_idx, minlength=scene.num_points)
+    scene, _ = scene.select(counts[scene.point_idx] >= 2)
+    in_air = tuple(camera.with_port(NoPort()) for camera in scene.cameras)
+    scene = replace(scene, cameras=in_air)
+    columns = np.full_like(layout_of(scene).border_col, HELD)
+    state = State.from_scene(scene)
+    term = LengthTerm(
+        ends=np.array([(2, 40)]),
+        lengths=np.array([3.0]),
+        variances=np.array([1e-6]),
+        of_frames=True,
+    )
+    known = Priors(reference=state, weights=np.zeros(columns.shape), terms=(term,))
+    for num_lengths, priors in ((0, None), (1, known)):
+        layout = build_layout(scene, columns, num_lengths=num_lengths)
+        eqs = likelihood(layout, state, priors)
+        reduced = reduced_covariance(layout, eqs, analyse(layout, kind))
+        assert reduced.determined == (num_lengths == 1)
+    dense = reduced_covariance(layout, eqs, analyse(layout, DENSE))
+    slope = np.zeros(layout.num_frame_cols + 1)
+    slope[6 * 30 + 3] = 1.0
+    variances = [one.variance_of(slope) for one in (reduced, dense)]
+    assert variances[0] == pytest.approx(variances[1], rel=1e-6)
+
+
+def test_sums_do_not_depend_on_the_number_of_threads(survey, monkeypatch):
+    layout = layout_of(survey.scene)
+    eqs = likelihood(layout, State.from_scene(survey.scene), None)
+    graph = build_graph(layout)
+    monkeypatch.setattr(schur, "CELLS_PER_THREAD", 10)
+    monkeypatch.setattr(schur, "POINTS_AT_ONCE", 100)
+    monkeypatch.setattr(threads, "_available", lambda: 3)
+    results = []
+    for count in (1, 2, 3):
+        with threads.limited(count):
+            system = schur.reduced_system(layout, graph, eqs, 1e-4)
+            step = np.linspace(-1.0, 1.0, layout.num_frame_cols + len(system.border))
+            points = schur.substitute_back(layout, graph, eqs, system.inverses, step)
+            results.append((*system, points))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_the_structure_decides_and_the_log_tells(caplog):
+    caplog.set_level(logging.DEBUG, "uwsfm")
+    assert analyse(layout_of(simulate_survey(SPEC, num_frames=12).scene)).kind == DENSE
+    survey = SurveySpec(num_frames=400, num_points=4000, detection_rate=0.5)
+    scene = simulate_survey(survey).scene
+    assert analyse(layout_of(scene)).kind == SPARSE
+    # Of the points that a short run of frames sees, nothing closes a loop.
+    first, last = np.full((2, scene.num_points), -1)
+    first[scene.point_idx[::-1]] = scene.frame_idx[::-1]
+    last[scene.point_idx] = scene.frame_idx
+    near = (last - first < 6)[scene.point_idx]
+    sequence = analyse(layout_of(scene.select(near)[0]))
+    assert sequence.kind == BANDED and sequence.width == 5
+    told = [record.getMessage() for record in caplog.records]
+    assert told[0].startswith("reduced system: dense")
+    assert told[1].startswith("reduced system: sparse (399 frames")
+    assert told[2].startswith("reduced system: banded") and "band of 5" in told[2]
+
+
+@pytest.mark.slow
+def test_a_survey_with_loops_converges_to_the_noise():
+    simulated = simulate_survey(
+        SurveySpec(num_frames=300, num_points=9000, detection_rate=0.6)
+    )
+    start = perturbed(
+        simulated.scene,
+        Perturbation(
+            rotation_stddev_deg=0.5, translation_stddev=0.02, point_stddev=0.03
+        ),
+    )
+    layout = layout_of(start)
+    assert analyse(layout).kind == SPARSE
+    options = LevenbergMarquardtOptions(loss="l2")
+    result = minimize(layout, State.from_scene(start), options)
+    freedom = 2 * len(layout.xy) - layout.num_unknowns - 3 * start.num_points
+    sigma = np.sqrt(np.sum(result.squares) / freedom)
+    # The standard deviation of an estimate from 1e5 numbers is 0.2 %.
+    assert sigma == pytest.approx(0.5, rel=0.01)
+    assert result.num_iterations <= 15

@@ -1,0 +1,183 @@
+"""Sparse Cholesky factor of 6x6 blocks, front by front, and what it tells.
+
+Multifrontal (Duff & Reid, ACM TOMS 1983): the sums are dense products of matrices, by
+BLAS. The blocks of the inverse at the places of the factor's follow from the last front
+to the first (Takahashi, Fagan & Chen 1973), without the inverse.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from uwsfm._jit import kernel
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.solver.elimination_tree import EliminationTree, Front
+
+
+class Panel(NamedTuple):
+    """The factor's part of one front: rows of L^T."""
+
+    own: Array
+    """(k, k) upper triangle."""
+    rest: Array
+    """(k, m)"""
+
+
+@kernel
+def _place_blocks(blocks, slots, where, own, rest):
+    """Add the blocks that start in a front, to the upper triangle of its rows."""
+    k = len(own)
+    for s in range(len(slots)):
+        slot, row, col, turned = slots[s], 6 * where[s, 0], 6 * where[s, 1], where[s, 2]
+        for a in range(6):
+            for b in range(6):
+                value = blocks[slot, b, a] if turned else blocks[slot, a, b]
+                if col < k:
+                    own[row + a, col + b] += value
+                else:
+                    rest[row + a, col - k + b] += value
+
+
+@kernel
+def _add_update(update, places, own, rest, after):
+    """Add what a child left, to the upper triangle of a front."""
+    k = len(own)
+    for i in range(len(places)):
+        row = 6 * places[i]
+        for j in range(i, len(places)):
+            col = 6 * places[j]
+            if col < k:
+                for a in range(6):
+                    for b in range(6):
+                        own[row + a, col + b] += update[6 * i + a, 6 * j + b]
+            elif row < k:
+                for a in range(6):
+                    for b in range(6):
+                        rest[row + a, col - k + b] += update[6 * i + a, 6 * j + b]
+            else:
+                for a in range(6):
+                    for b in range(6):
+                        after[row - k + a, col - k + b] += update[6 * i + a, 6 * j + b]
+
+
+@kernel
+def _take_blocks(slots, where, own, rest, blocks):
+    """The other way round: blocks of the graph from the rows of a front."""
+    k = len(own)
+    for s in range(len(slots)):
+        slot, row, col, turned = slots[s], 6 * where[s, 0], 6 * where[s, 1], where[s, 2]
+        for a in range(6):
+            for b in range(6):
+                value = own[row + a, col + b] if col < k else rest[row + a, col - k + b]
+                if turned:
+                    blocks[slot, b, a] = value
+                else:
+                    blocks[slot, a, b] = value
+
+
+@kernel
+def _gather(own, rest, after, places, out):
+    """Rows and columns of a symmetric front, in blocks."""
+    k = len(own)
+    for i in range(len(places)):
+        row = 6 * places[i]
+        for j in range(len(places)):
+            col = 6 * places[j]
+            for a in range(6):
+                for b in range(6):
+                    r, c = row + a, col + b
+                    if r < k:
+                        value = own[r, c] if c < k else rest[r, c - k]
+                    else:
+                        value = rest[c, r - k] if c < k else after[r - k, c - k]
+                    out[6 * i + a, 6 * j + b] = value
+
+
+class BlockCholesky:
+    """A factor L of the frames' part, A = L L^T in the order of a tree."""
+
+    def __init__(self, tree: EliminationTree) -> None:
+        self.order = tree.order
+        self._fronts = tree.fronts
+        self._panels: list[Panel] = [
+            Panel(
+                np.empty((6 * f.num_pivots, 6 * f.num_pivots)),
+                np.empty((6 * f.num_pivots, 6 * len(f.rows))),
+            )
+            for f in tree.fronts
+        ]
+        self._rows = [_in_columns(f) for f in tree.fronts]
+
+    def factorize(self, blocks: Array) -> bool:
+        """Factor blocks (number of blocks, 6, 6); False if they are not positive."""
+        updates: dict[int, Array] = {}
+        for number, front in enumerate(self._fronts):
+            own, rest = self._panels[number]
+            own[...], rest[...] = 0.0, 0.0
+            after = np.zeros((rest.shape[1], rest.shape[1]))
+            _place_blocks(blocks, front.slots, front.where, own, rest)
+            for child, places in zip(front.children, front.maps, strict=True):
+                _add_update(updates.pop(child), places, own, rest, after)
+            # Fortran reads rows as columns: our upper triangles are its lower ones.
+            _, info = lapack.dpotrf(own.T, lower=1, clean=0, overwrite_a=1)
+            if info != 0:
+                return False
+            if rest.size:
+                blas.dtrsm(
+                    1.0, own.T, rest.T, side=1, lower=1, trans_a=1, overwrite_b=1
+                )
+                blas.dsyrk(-1.0, rest.T, beta=1.0, c=after.T, lower=1, overwrite_c=1)
+                updates[number] = after
+        return bool(np.isfinite([np.sum(p.own[-1]) for p in self._panels]).all())
+
+    def solve_half(self, right: Array) -> Array:
+        """L^-1 times columns (6 n, r) in the factor's order."""
+        out = right.copy()
+        for front, panel, rows in zip(
+            self._fronts, self._panels, self._rows, strict=True
+        ):
+            part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
+            blas.dtrsm(
+                1.0, panel.own.T, part.T, side=1, lower=1, trans_a=1, overwrite_b=1
+            )
+            if len(rows):
+                out[rows] -= panel.rest.T @ part
+        return out
+
+    def solve_other_half(self, right: Array) -> Array:
+        """L^-T times columns (6 n, r)."""
+        out = right.copy()
+        for front, panel, rows in zip(
+            self._fronts[::-1], self._panels[::-1], self._rows[::-1], strict=True
+        ):
+            part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
+            if len(rows):
+                part -= panel.rest @ out[rows]
+            blas.dtrsm(1.0, panel.own.T, part.T, side=1, lower=1, overwrite_b=1)
+        return out
+
+    def inverse_blocks(self, blocks: Array) -> None:
+        """Write the blocks of A^-1 in the pattern of those of A."""
+        known: dict[int, Array] = {}
+        for number in range(len(self._fronts) - 1, -1, -1):
+            front = self._fronts[number]
+            own, rest = self._panels[number]
+            after = known.pop(number, np.empty((0, 0)))
+            root, _ = lapack.dtrtri(own.T, lower=1)
+            root = np.tril(root)  # L11^-1
+            inverse, reach = root.T @ root, np.empty_like(rest)
+            if rest.size:
+                forward = root.T @ rest  # (L21 L11^-1)^T
+                reach = -forward @ after
+                inverse -= reach @ forward.T
+            _take_blocks(front.slots, front.where, inverse, reach, blocks)
+            for child, places in zip(front.children, front.maps, strict=True):
+                part = np.empty((6 * len(places), 6 * len(places)))
+                _gather(inverse, reach, after, places, part)
+                known[child] = part
+
+
+def _in_columns(front: Front):
+    """Columns of a front's rows."""
+    return (6 * front.rows[:, None] + np.arange(6)).ravel()

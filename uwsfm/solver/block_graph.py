@@ -1,0 +1,122 @@
+"""Which frames share points: the pattern of the reduced system, found once per layout.
+
+Free frames are numbered by their columns. Row i of the lower triangle has a 6x6 block
+for every frame j <= i that sees a point of frame i.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwsfm._jit import kernel
+from uwsfm.scene import IndexArray
+from uwsfm.solver.layout import HELD, Layout
+
+
+class BlockGraph(NamedTuple):
+    """The blocks of every row; F free frames, P points, K cells."""
+
+    frame: IndexArray
+    """(F,) of the scene."""
+    cell_row: IndexArray
+    """(K,) free frame of each cell, or HELD."""
+    point_order: IndexArray
+    """(P,) by their first frames: neighbours then touch the same blocks."""
+    row_start: IndexArray
+    """(F + 1,) first block of each row."""
+    row_other: IndexArray
+    """(number of blocks,) the other frame of each block, rising; a row ends with its
+    own frame."""
+    work_start: IndexArray
+    """(F + 1,) products of cells that the rows before this one take."""
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.frame)
+
+    @property
+    def num_blocks(self) -> int:
+        return len(self.row_other)
+
+
+def build_graph(layout: Layout) -> BlockGraph:
+    """The pattern of a layout's reduced system."""
+    frame = np.flatnonzero(layout.frame_col != HELD)
+    row_of = np.full(len(layout.frame_col), HELD, dtype=np.int64)
+    row_of[frame] = np.arange(len(frame))  # columns rise with the frames
+    cell_row = row_of[layout.cell_frame]
+    point_start = layout.point_start
+    point = np.repeat(np.arange(len(point_start) - 1), np.diff(point_start))
+    free = cell_row != HELD
+    counts = np.bincount(cell_row[free], minlength=len(frame))
+    entry_start = np.concatenate([[0], np.cumsum(counts)])
+    # Cells by frame; the stable sort keeps them rising. HELD comes first.
+    entry_cell = np.argsort(cell_row, kind="stable")[np.count_nonzero(~free) :]
+    entries = (point_start, cell_row, entry_start, entry_cell, point[entry_cell])
+    num_blocks, work = np.zeros((2, len(frame)), dtype=np.int64)
+    _count_blocks(entries, num_blocks, work)
+    row_start = np.concatenate([[0], np.cumsum(num_blocks)])
+    row_other = np.empty(row_start[-1], dtype=np.int64)
+    _list_blocks(entries, row_start, row_other)
+    first_row = np.full(len(point_start) - 1, len(frame))
+    np.minimum.at(first_row, point[free], cell_row[free])
+    return BlockGraph(
+        frame=frame,
+        cell_row=cell_row,
+        point_order=np.argsort(first_row, kind="stable"),
+        row_start=row_start,
+        row_other=row_other,
+        work_start=np.concatenate([[0], np.cumsum(work)]),
+    )
+
+
+@kernel
+def _mark_row(entries, i, seen):
+    """Mark with i the frames j <= i that share a point with frame i; their number, and
+    how many cells were met."""
+    point_start, cell_row, entry_start, entry_cell, entry_point = entries
+    seen[i] = i
+    count, met = 1, 0
+    for e in range(entry_start[i], entry_start[i + 1]):
+        for other in range(point_start[entry_point[e]], entry_cell[e]):
+            j = cell_row[other]
+            if j == HELD:
+                continue
+            met += 1
+            if seen[j] != i:
+                seen[j] = i
+                count += 1
+    return count, met
+
+
+@kernel
+def _count_blocks(entries, num_blocks, work):
+    seen = np.full(len(num_blocks), -1)
+    for i in range(len(num_blocks)):
+        num_blocks[i], met = _mark_row(entries, i, seen)
+        # Folding a cell costs about as much as four products, beside its own.
+        work[i] = met + 5 * (entries[2][i + 1] - entries[2][i]) + 1
+
+
+@kernel
+def _list_blocks(entries, row_start, row_other):
+    seen = np.full(len(row_start) - 1, -1)
+    for i in range(len(seen)):
+        _mark_row(entries, i, seen)
+        at = row_start[i + 1]
+        for j in range(i, -1, -1):
+            if at == row_start[i]:
+                break
+            if seen[j] == i:
+                at -= 1
+                row_other[at] = j
+
+
+@kernel
+def find_block(row_start, row_other, i, j, start):
+    """Where the block of row i and frame j <= i is, not before ``start``."""
+    end = row_start[i + 1] - 1
+    s = max(start, end - (i - j))  # as many frames lie between them, at most
+    while row_other[s] < j:
+        s += 1
+    return s
