@@ -2,6 +2,8 @@
 
 import os
 import platform
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,27 @@ def description() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "versions": versions(),
     }
+
+
+def watched(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a section measures, with the machine, and how busy others kept it."""
+    wall, busy, own = time.perf_counter(), _busy_s(), _own_s()
+    found = measure()
+    wall, busy = time.perf_counter() - wall, _busy_s() - busy
+    others = max(0.0, busy - (_own_s() - own)) / wall
+    return {**found, "machine": description(), "others_cores": round(others, 2)}
+
+
+def _busy_s() -> float:
+    """CPU seconds of all processes since the machine started."""
+    times = psutil.cpu_times()
+    return float(times.user + times.system + getattr(times, "nice", 0.0))
+
+
+def _own_s() -> float:
+    """CPU seconds of this process and of its children that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def _cpu_model() -> str:

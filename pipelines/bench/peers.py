@@ -32,7 +32,7 @@ def pinhole_colmap(num_frames: int, folder: str) -> dict[str, Any]:
     """COLMAP's bundle adjustment of rig, poses and points, without any water.
 
     The observations are those of pinholes, so that it has no model error to fight. Only
-    its minimiser is timed, not how it sets its problem up.
+    its minimiser's share of the CPU time counts, not how it sets its problem up.
     """
     truth = surveys.as_pinholes(surveys.load(num_frames, folder))
     start = surveys.start_of(truth)
@@ -49,19 +49,17 @@ def pinhole_colmap(num_frames: int, folder: str) -> dict[str, Any]:
     for image_id in reconstruction.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    clock = time.process_time()
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+    clock = time.process_time()
     found = adjuster.solve().ceres_summary
     cpu = time.process_time() - clock
+    share = found.minimizer_time_in_seconds / found.total_time_in_seconds
     # The evaluation of the start counts as a step there.
     steps = found.num_successful_steps + found.num_unsuccessful_steps - 1
     return {
         "observations": truth.num_observations,
         "iterations": steps,
-        "us_per_observation": 1e6
-        * found.minimizer_time_in_seconds
-        / steps
-        / truth.num_observations,
+        "us_per_observation": 1e6 * share * cpu / steps / truth.num_observations,
         "with_setup_us_per_observation": 1e6 * cpu / steps / truth.num_observations,
         "rms_px": float(np.sqrt(2.0 * found.final_cost / truth.num_observations)),
         "linear_solver": found.linear_solver_type_used.name,

@@ -39,8 +39,7 @@ def main() -> None:
     sections = all_sections(options)
     for name in options.only or sections:
         print(name, flush=True)
-        found = {**sections[name](), "machine": machine.description()}
-        write_json(found, work / f"{name}.json")
+        write_json(machine.watched(sections[name]), work / f"{name}.json")
     results = measured(work, sections)
     results["targets"] = [
         {"what": one.what, "target": one.target, "unit": one.unit}

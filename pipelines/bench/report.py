@@ -6,6 +6,9 @@ from kernels import STAGES as KERNEL_STAGES
 from solver import STAGES as SOLVER_STAGES
 from targets import Results, outcomes, solved_sizes
 
+QUIET = 0.2
+"""Cores that other programs may use."""
+
 
 def markdown(results: Results) -> str:
     parts = [_machine(results), _targets(results), _kernels(results)]
@@ -21,10 +24,22 @@ def table(header: list[str], rows: list[list[str]]) -> str:
 def _machine(results: Results) -> str:
     found = results["machine"]
     versions = ", ".join(f"{k} {v}" for k, v in found["versions"].items())
-    return (
+    text = (
         f"Machine: {found['cpu']}; {found['cores']} cores, {found['memory_gb']} GB, "
         f"{found['system']}. {versions}."
     )
+    loud = [
+        f"{name} ({one['others_cores']:.1f})"
+        for name, one in results.items()
+        if isinstance(one, dict) and one.get("others_cores", 0.0) > QUIET
+    ]
+    if loud:
+        text += (
+            "\n\n**The machine was not quiet**: cores that other programs used "
+            f"meanwhile: {', '.join(loud)}. Wall times, and the ratios of threads, are "
+            "worse than on an idle machine."
+        )
+    return text
 
 
 def _targets(results: Results) -> str:
@@ -168,8 +183,8 @@ def _demo(results: Results) -> str:
     lines = [[k, f"{v:.2f}", f"{100 * v / total:.0f} %"] for k, v in stages.items()]
     lines.append(["whole", f"{total:.2f}", "100 %"])
     return (
-        f"## `uwsfm demo`\n\nWarm, seconds on the wall with all cores; a second run in "
-        f"the same folder takes {found['second_run_s']:.1f} s, of which "
-        f"{found['second_start_s']:.1f} s are not its adjustment and export.\n\n"
-        + table(["stage", "s", "share"], lines)
+        "## `uwsfm demo`\n\nWarm, seconds on the wall with all cores "
+        f"({found['cpu_s']:.0f} s of CPU); a second run in the same folder takes "
+        f"{found['second_run_s']:.1f} s, of which {found['second_start_s']:.1f} s are "
+        "not its adjustment and export.\n\n" + table(["stage", "s", "share"], lines)
     )
