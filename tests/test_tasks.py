@@ -4,11 +4,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from uwsfm.demo import sample_dir
@@ -27,28 +29,22 @@ def square(number: int) -> int:
     return number**2
 
 
-def refuse(number: int, refused: int) -> int:
-    if number == refused:
-        raise InputError(f"number {number} is refused")
-    return number
+def refuse(number: int) -> int:
+    raise InputError(f"number {number} is refused")
 
 
-def die_once(number: int, fatal: int, folder: Path) -> tuple[int, int]:
-    """Kill the process at one number, the first time it comes."""
-    with (folder / f"{number}-{os.getpid()}").open("w"):
-        pass
-    if number == fatal and len(list(folder.glob(f"{number}-*"))) == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number, os.getpid()
-
-
-def stumble(number: int, folder: Path) -> int:
-    """Fail as often as is forgiven."""
+def misbehave(number: int, folder: Path) -> tuple[int, int]:
+    """Number 3 takes its process along, once; 4 fails as often as is forgiven; 5 is
+    refused."""
     trial = len(list(folder.glob(f"{number}-*")))
     (folder / f"{number}-{trial}").touch()
-    if trial < RETRIES:
+    if number == 3 and trial == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 4 and trial < RETRIES:
         raise OSError("disk full")
-    return number
+    if number == 5:
+        refuse(number)
+    return number, os.getpid()
 
 
 def test_one_process_does_all_in_order(tmp_path):
@@ -58,25 +54,52 @@ def test_one_process_does_all_in_order(tmp_path):
             square, [(k,) for k in range(5)], "squares", lambda *s: seen.append(s)
         )
     assert found == [0, 1, 4, 9, 16]
+        with pytest.raises(InputError, match="number 2 is refused"):
+            workers.run(refuse, [(2,), (3,)], "refusing")
     assert seen == [("squares", k, 5) for k in range(6)]
 
 
 def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
-    for name in ("die", "stumble"):
-        (tmp_path / name).mkdir()
     with Workers(max_processes=2) as workers:
-        if workers.num_processes < 2:
-            pytest.skip("one core")
-        tasks = [(k, 3, tmp_path / "die") for k in range(8)]
-        found = workers.run(die_once, tasks, "dying")
-        assert [number for number, _ in found] == list(range(8))
-        assert os.getpid() not in [process for _, process in found]
-        # The fatal task was done twice; no other was lost with it.
-        assert len(list((tmp_path / "die").glob("3-*"))) == 2
-        tasks = [(k, tmp_path / "stumble") for k in range(3)]
-        assert workers.run(stumble, tasks, "stumbling") == [0, 1, 2]
-        with pytest.raises(InputError, match="number 2 is refused"):
-            workers.run(refuse, [(k, 2) for k in range(4)], "refusing")
+        tasks = [(number, tmp_path) for number in range(8)]
+        found = workers.outcomes(misbehave, tasks, "misbehaving")
+    refused = found.pop(5)
+    assert isinstance(refused, InputError) and str(refused) == "number 5 is refused"
+    assert [number for number, _ in found] == [0, 1, 2, 3, 4, 6, 7]
+    assert os.getpid() not in [process for _, process in found]
+    # What was fatal was done twice, what is wrong once.
+    counts = [len(list(tmp_path.glob(f"{number}-*"))) for number in (3, 4, 5)]
+    assert counts == [2, RETRIES + 1, 1]
+
+
+ORPHANS = """
+import os, psutil, signal, time
+from uwsfm.tasks import Workers
+
+def kill(step, done, total):
+    if done == 1:
+        children = psutil.Process().children(recursive=True)
+        print(*[child.pid for child in children], flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+with Workers(max_processes=2) as workers:
+    workers.run(time.sleep, [(1.0,) for _ in range(4)], "sleeping", kill)
+"""
+
+
+@pytest.mark.slow
+def test_processes_end_when_who_started_them_is_killed():
+    """No script guards its main part, and none has to."""
+    found = subprocess.run(
+        [sys.executable, "-c", ORPHANS], stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert found.returncode == -signal.SIGKILL
+    orphans = [int(word) for word in found.stdout.split()]
+    assert len(orphans) >= 3  # a scheduler and two workers, with who watches them
+    deadline = time.monotonic() + 90.0  # three times what they wait for a task
+    while any(psutil.pid_exists(orphan) for orphan in orphans):
+        assert time.monotonic() < deadline
+        time.sleep(1.0)
 
 
 @contextmanager

@@ -33,6 +33,9 @@ LOCAL = "local"
 RETRIES = 2
 """Of a task that fails for another reason than its input: a full disk, say."""
 CONNECT_SECONDS = 10
+ORPHANED = "30s"
+"""Without a task, after which processes of this machine end: whoever started them was
+killed."""
 BYTES_PER_WORKER = 1.5e9
 """That a submap of 200 frames with 4000 features per image needs at its peak, about."""
 
@@ -143,33 +146,32 @@ class Workers:
         from distributed import as_completed
 
         progress(step, 0, len(arguments))
-        client = self._client or self._start_processes()
-        futures = client.map(
-            _call,
-            [(sys.path, cloudpickle.dumps((function, each))) for each in arguments],
-            key=[f"{step}-{os.urandom(8).hex()}" for _ in arguments],
-            retries=RETRIES,
-            pure=False,
-        )
-        place = {future.key: index for index, future in enumerate(futures)}
-        try:
+        with ExitStack() as processes:
+            client = self._client or self._start_processes(processes)
+            futures = client.map(
+                _call,
+                [(sys.path, cloudpickle.dumps((function, each))) for each in arguments],
+                key=[f"{step}-{os.urandom(8).hex()}" for _ in arguments],
+                retries=RETRIES,
+                pure=False,
+            )
+            processes.callback(client.cancel, futures)
+            place = {future.key: index for index, future in enumerate(futures)}
             for done, future in enumerate(as_completed(futures), start=1):
                 yield place[future.key], _result_of(future, step)
                 progress(step, done, len(arguments))
-        finally:
-            client.cancel(futures)
 
-    def _start_processes(self) -> Client:
-        """A cluster of processes of one thread each, which end with this object.
+    def _start_processes(self, processes: ExitStack) -> Client:
+        """A cluster of processes of one thread each, which end with the stack.
 
         They are started by command line: a process that is spawned from here would run
-        the caller's script again.
+        the caller's script again. If this one is killed, they end by themselves.
         """
         import dask
         from distributed import Client, LocalCluster, SubprocessCluster
 
         logger.info("starting %d worker processes", self.num_processes)
-        scratch = self._resources.enter_context(
+        scratch = processes.enter_context(
             tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
         )
         common: dict[str, Any] = {
@@ -186,11 +188,15 @@ class Workers:
             if sys.platform == "win32":  # where processes can only be spawned
                 cluster = LocalCluster(**common, **each)
             else:
-                cluster = SubprocessCluster(**common, worker_kwargs=each)
-        self._resources.callback(cluster.close)
-        self._client = Client(cluster)
-        self._resources.callback(self._client.close)
-        return self._client
+                cluster = SubprocessCluster(
+                    **common,
+                    worker_kwargs=each,
+                    scheduler_kwargs={"idle_timeout": ORPHANED},
+                )
+        processes.callback(cluster.close)
+        client = Client(cluster)
+        processes.callback(client.close)
+        return client
 
     def _connect(self) -> None:
         from distributed import Client
