@@ -53,9 +53,9 @@ def test_one_process_does_all_in_order(tmp_path):
         found = workers.run(
             square, [(k,) for k in range(5)], "squares", lambda *s: seen.append(s)
         )
-    assert found == [0, 1, 4, 9, 16]
         with pytest.raises(InputError, match="number 2 is refused"):
             workers.run(refuse, [(2,), (3,)], "refusing")
+    assert found == [0, 1, 4, 9, 16]
     assert seen == [("squares", k, 5) for k in range(6)]
 
 
