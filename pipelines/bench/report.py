@@ -118,9 +118,9 @@ def _solver(results: Results) -> str:
     return "\n\n".join(
         [
             "## Solver",
-            "CPU milliseconds on one core: of the set-up (observations sorted, structure "
-            "found), and of one iteration, whole and by stage; peak memory of "
-            "the process in MB (and before the solve).",
+            "CPU milliseconds on one core: of the set-up (observations sorted, "
+            "structure found), and of one iteration, whole and by stage; peak memory "
+            "of the process in MB (and before the solve).",
             table([*header, *SOLVER_STAGES, "MB"], lines),
             *(["The solver's own words: " + "; ".join(said) + "."] if said else []),
             "![time per observation](solver.png) ![memory](memory.png)",
