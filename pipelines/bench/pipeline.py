@@ -114,6 +114,8 @@ def all_sections(options: argparse.Namespace) -> Sections:
                 binary=options.refractive_colmap,
             )
     sections["demo"] = partial(demo.measure, small=small)
+    if not small:
+        sections["first-run"] = demo.first_run
     return sections
 
 

@@ -192,9 +192,7 @@ def _peers(results: Results) -> Iterator[Outcome]:
 
 
 def _demo(results: Results) -> Iterator[Outcome]:
-    found = results.get("demo")
-    if found is None:
-        return
+    found = {**results.get("demo", {}), **results.get("first-run", {})}
     for key, what, limit in (
         ("wall_s", "`uwsfm demo`, warm", 60.0),
         ("second_start_s", "second run in one folder, but for its adjustment", 2.0),
