@@ -48,7 +48,8 @@ def _kernels(results: Results, path: Path) -> None:
     axes.set_yscale("log")
     axes.set_ylabel("ns per observation, one core")
     axes.set_xticks(places, KERNEL_STAGES)
-    axes.legend(title="dashed: target", fontsize="small")
+    figure.legend(fontsize="small", ncols=len(wanted), loc="upper center")
+    axes.set_title("\ndashed: target", fontsize="small")
     _save(figure, path)
 
 
