@@ -23,7 +23,7 @@ from uwsfm.solver import schur
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import suitable_blas
 from uwsfm.solver.quasidefinite import symmetric
-from uwsfm.solver.reduced_factor import inverse
+from uwsfm.solver.reduced_factor import coupling_columns, inverse
 from uwsfm.solver.reduction import analyse
 
 FOCAL, CX, CY = border.FIRST_LENS, border.FIRST_LENS + 2, border.FIRST_LENS + 3
@@ -145,14 +145,14 @@ def _propagate(
         kept = np.r_[:num_free, layout.num_camera_cols : layout.num_border_cols]
         moved = np.arange(num_free, layout.num_camera_cols)
         part = whole._replace(
-            coupling=np.ascontiguousarray(whole.coupling[:, :, kept]),
+            coupling=np.ascontiguousarray(whole.coupling[:, kept]),
             border=border[np.ix_(kept, kept)],
             right_border=whole.right_border[kept],
         )
         found = inverse(reduction, part, layout.num_lengths)
         if found is None:
             return np.full(changes.shape, np.nan)
-        coupling = whole.coupling[:, :, moved].reshape(offset, len(moved))
+        coupling = coupling_columns(whole)[:, moved]
         right = -np.concatenate([coupling, border[np.ix_(kept, moved)]])
         right = right @ changes[:, given].T  # (n, E)
         if priors is not None:

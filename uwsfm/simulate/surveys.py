@@ -111,7 +111,7 @@ def simulate_survey(
             raise InputError(f"no survey {survey!r}; there are: {', '.join(SURVEYS)}")
         survey = SURVEYS[survey]
     spec = replace(survey, **changes)
-    return simulate_scene(
+    simulated = simulate_scene(
         rig or paper_rig(),
         survey_track(spec),
         Relief(stddev=spec.relief, seed=spec.seed),
@@ -122,4 +122,31 @@ def simulate_survey(
             detection_rate=spec.detection_rate,
             seed=spec.seed,
         ),
+    )
+    return _by_first_frame(simulated)
+
+
+def _by_first_frame(simulated: SimulatedScene) -> SimulatedScene:
+    """Points numbered as frames first see them, as a reconstruction numbers them."""
+    truth = simulated.truth
+    first = np.full(truth.num_points, truth.num_frames)
+    np.minimum.at(first, truth.point_idx, truth.frame_idx)
+    order = np.argsort(first, kind="stable")
+    number = np.empty_like(order)
+    number[order] = np.arange(len(order))
+    point_idx = number[truth.point_idx]
+    rows = np.argsort(point_idx, kind="stable")
+    scene, truth = (
+        replace(
+            part,
+            points=part.points[order],
+            camera_idx=part.camera_idx[rows],
+            frame_idx=part.frame_idx[rows],
+            point_idx=point_idx[rows],
+            xy=part.xy[rows],
+        )
+        for part in (simulated.scene, truth)
+    )
+    return SimulatedScene(
+        scene=scene, truth=truth, is_outlier=simulated.is_outlier[rows]
     )

@@ -12,6 +12,9 @@ from uwsfm._jit import kernel
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD, Layout
 
+MANY_BLOCKS = 30_000
+"""Of 288 bytes each."""
+
 
 class BlockGraph(NamedTuple):
     """The blocks of every row; F free frames, P points, K cells."""
@@ -21,7 +24,9 @@ class BlockGraph(NamedTuple):
     cell_row: IndexArray
     """(K,) free frame of each cell, or HELD."""
     point_order: IndexArray
-    """(P,) by their first frames: neighbours then touch the same blocks."""
+    """(P,) to go through them in: as they come, which is how their cells lie in memory;
+    by their first frames if the blocks are too many for a cache to hold, so that
+    neighbours touch the same."""
     row_start: IndexArray
     """(F + 1,) first block of each row."""
     row_other: IndexArray
@@ -58,8 +63,10 @@ def build_graph(layout: Layout) -> BlockGraph:
     row_start = np.concatenate([[0], np.cumsum(num_blocks)])
     row_other = np.empty(row_start[-1], dtype=np.int64)
     _list_blocks(entries, row_start, row_other)
-    first_row = np.full(len(point_start) - 1, len(frame))
-    np.minimum.at(first_row, point[free], cell_row[free])
+    first_row = np.zeros(len(point_start) - 1, dtype=np.int64)
+    if len(row_other) > MANY_BLOCKS:
+        first_row[:] = len(frame)
+        np.minimum.at(first_row, point[free], cell_row[free])
     return BlockGraph(
         frame=frame,
         cell_row=cell_row,

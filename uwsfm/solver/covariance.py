@@ -93,10 +93,10 @@ def reduced_covariance(
     system = schur.reduced_system(layout, reduction.graph, eqs, 0.0)
     found = inverse(reduction, system, layout.num_lengths)
     if found is None:
-        blocks, coupling, border = (
-            np.full_like(part, np.nan)
-            for part in (system.blocks, system.coupling, system.border)
+        blocks, border = (
+            np.full_like(part, np.nan) for part in (system.blocks, system.border)
         )
+        coupling = np.full((reduction.graph.num_frames, 6, len(border)), np.nan)
     else:
         blocks, coupling, border = found.blocks, found.coupling, found.border
     return ReducedCovariance(

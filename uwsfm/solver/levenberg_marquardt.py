@@ -24,7 +24,7 @@ from uwsfm.solver.normal_equations import (
     total_cost,
 )
 from uwsfm.solver.reduced_factor import solve
-from uwsfm.solver.reduction import Reduction, analyse
+from uwsfm.solver.reduction import DENSE, Reduction, analyse
 from uwsfm.solver.schur import ReducedSystem
 from uwsfm.solver.state import State
 from uwsfm.solver.threads import num_threads
@@ -198,9 +198,14 @@ Report = Callable[[int, float], None]
 
 
 def suitable_blas(reduction: Reduction) -> threadpool_limits:
-    """A context with as many BLAS threads as a reduced system is worth."""
-    small = reduction.largest_matrix < SINGLE_BLAS_BELOW
-    return threadpool_limits(1 if small else num_threads(), user_api="blas")
+    """A context with as many BLAS threads as a reduced system is worth.
+
+    One for bands and fronts, of which most are small.
+    """
+    layout = reduction.layout
+    size = layout.num_frame_cols + layout.num_border_cols
+    large = reduction.kind == DENSE and size >= SINGLE_BLAS_BELOW
+    return threadpool_limits(num_threads() if large else 1, user_api="blas")
 
 
 def minimize(

@@ -46,9 +46,15 @@ def dense_matrix(reduction: Reduction, system: ReducedSystem) -> Array:
     size = offset + len(system.border)
     matrix = np.zeros((size, size))
     _spread(reduction.graph, system.blocks, matrix)
-    matrix[offset:, :offset] = system.coupling.reshape(offset, len(system.border)).T
+    matrix[offset:, :offset] = coupling_columns(system).T
     matrix[offset:, offset:] = system.border
     return matrix
+
+
+def coupling_columns(system: ReducedSystem) -> Array:
+    """(6 F, B) of frames and border."""
+    columns = np.swapaxes(system.coupling, 1, 2)
+    return columns.reshape(6 * len(columns), len(system.border))
 
 
 def right_side(system: ReducedSystem) -> Array:
@@ -157,7 +163,8 @@ class Bordered:
     def _coupling(self, system: ReducedSystem) -> Array:
         """C (6 n, 6 outer frames + B) in the factor's order."""
         columns = [self._column(frame, system) for frame in self.reduction.outer]
-        whole = np.concatenate([*columns, system.coupling], axis=2)
+        own = np.swapaxes(system.coupling, 1, 2)
+        whole = np.concatenate([*columns, own], axis=2)
         return permuted(self.factor.order, whole)
 
     def _column(self, frame: int, system: ReducedSystem) -> Array:
@@ -178,7 +185,7 @@ class Bordered:
             return border
         (frame,) = self.reduction.outer
         own = system.blocks[self.reduction.graph.row_start[frame + 1] - 1]
-        coupling = system.coupling[frame]
+        coupling = system.coupling[frame].T
         return np.block([[own, coupling], [coupling.T, border]])
 
     def step(self, right: Array) -> Array | None:
@@ -236,7 +243,7 @@ class Bordered:
             stiff = -symmetric(system.border)[-self.num_lengths :, -self.num_lengths :]
             pull = np.concatenate(
                 [
-                    system.coupling.reshape(len(frames), -1)[:, -self.num_lengths :],
+                    coupling_columns(system)[:, -self.num_lengths :],
                     system.border[-self.num_lengths :, : -self.num_lengths].T,
                 ]
             )

@@ -55,14 +55,6 @@ class Reduction:
     """Of the band, frames."""
     tree: EliminationTree | None
 
-    @property
-    def largest_matrix(self) -> int:
-        """Columns of the largest dense matrix that is factored."""
-        if self.tree is None:
-            return self.layout.num_frame_cols + self.layout.num_border_cols
-        sizes = [front.num_pivots + len(front.rows) for front in self.tree.fronts]
-        return max(self.layout.num_border_cols, 6 * max(sizes, default=0))
-
     @cached_property
     def factor(self) -> BlockCholesky | BandedCholesky:
         """Storage for the factor of the inner frames, used again by every step."""

@@ -34,7 +34,7 @@ class ReducedSystem(NamedTuple):
     blocks: Array
     """(number of blocks, 6, 6): of row i and frame j <= i, rows of j, columns of i."""
     coupling: Array
-    """(F, 6, B) of frames and border."""
+    """(F, B, 6) of border and frames."""
     border: Array
     """(B, B), lower triangle."""
     right_frames: Array
@@ -97,13 +97,11 @@ def invert_points(eqs, damping, first, last, inverses, border, right):
 
 
 @kernel
-def _fold_cell(
-    cells, inverses, points_grad, points_border, c, p, i, right, coupling, folded
-):
-    """W V^-1 (6, 3) of one cell, and its part of right side and coupling of row i."""
+def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
+    """W V^-1 (6, 3) of one cell, and its part of the right side of row i."""
     v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
     v11, v12, v22 = inverses[p, 1, 1], inverses[p, 1, 2], inverses[p, 2, 2]
-    g0, g1, g2 = points_grad[p, 0], points_grad[p, 1], points_grad[p, 2]
+    g0, g1, g2 = grads[p, 0], grads[p, 1], grads[p, 2]
     for a in range(6):
         w0, w1, w2 = cells[c, a, 0], cells[c, a, 1], cells[c, a, 2]
         f0 = w0 * v00 + w1 * v01 + w2 * v02
@@ -111,12 +109,28 @@ def _fold_cell(
         f2 = w0 * v02 + w1 * v12 + w2 * v22
         folded[a, 0], folded[a, 1], folded[a, 2] = f0, f1, f2
         right[i, a] += f0 * g0 + f1 * g1 + f2 * g2
-        for k in range(coupling.shape[2]):
-            coupling[i, a, k] -= (
-                f0 * points_border[p, 0, k]
-                + f1 * points_border[p, 1, k]
-                + f2 * points_border[p, 2, k]
-            )
+
+
+@kernel
+def _subtract_border(borders, p, i, folded, coupling):
+    """Coupling (B, 6) of row i -= E^T (W V^-1)^T."""
+    # Six lanes: all that a line needs is loaded before it is stored.
+    f00, f10, f20 = folded[0, 0], folded[1, 0], folded[2, 0]
+    f30, f40, f50 = folded[3, 0], folded[4, 0], folded[5, 0]
+    f01, f11, f21 = folded[0, 1], folded[1, 1], folded[2, 1]
+    f31, f41, f51 = folded[3, 1], folded[4, 1], folded[5, 1]
+    f02, f12, f22 = folded[0, 2], folded[1, 2], folded[2, 2]
+    f32, f42, f52 = folded[3, 2], folded[4, 2], folded[5, 2]
+    for k in range(coupling.shape[1]):
+        w0, w1, w2 = borders[p, 0, k], borders[p, 1, k], borders[p, 2, k]
+        b0 = coupling[i, k, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
+        b1 = coupling[i, k, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
+        b2 = coupling[i, k, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
+        b3 = coupling[i, k, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
+        b4 = coupling[i, k, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
+        b5 = coupling[i, k, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
+        coupling[i, k, 0], coupling[i, k, 1], coupling[i, k, 2] = b0, b1, b2
+        coupling[i, k, 3], coupling[i, k, 4], coupling[i, k, 5] = b3, b4, b5
 
 
 @kernel
@@ -124,7 +138,6 @@ def _subtract_products(
     row_start, row_other, cell_row, first, last, i, cells, folded, blocks
 ):
     """Blocks of row i -= W' (W V^-1)^T for the cells W' of a point up to its own."""
-    # Six lanes: all that a line of the block needs is loaded before it is stored.
     f00, f10, f20 = folded[0, 0], folded[1, 0], folded[2, 0]
     f30, f40, f50 = folded[3, 0], folded[4, 0], folded[5, 0]
     f01, f11, f21 = folded[0, 1], folded[1, 1], folded[2, 1]
@@ -161,8 +174,8 @@ def _fill_rows(graph, eqs, damping, first, last, system):
             for b in range(6):
                 blocks[own, a, b] = eqs.frames[f, a, b]
             blocks[own, a, a] += damping * max(eqs.frames[f, a, a], MIN_DIAGONAL)
-            for k in range(coupling.shape[2]):
-                coupling[i, a, k] = eqs.frames_border[f, a, k]
+            for k in range(coupling.shape[1]):
+                coupling[i, k, a] = eqs.frames_border[f, a, k]
 
 
 @kernel
@@ -186,9 +199,8 @@ def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
         for c in range(start, point_start[p + 1]):
             i = cell_row[c]
             if first <= i < last:
-                _fold_cell(
-                    cells, inverses, grads, borders, c, p, i, right, coupling, folded
-                )
+                _fold_cell(cells, inverses, grads, c, p, i, folded, right)
+                _subtract_border(borders, p, i, folded, coupling)
                 _subtract_products(
                     row_start,
                     row_other,
@@ -283,7 +295,7 @@ def empty_system(layout: Layout, graph: BlockGraph) -> ReducedSystem:
     num_border = layout.num_border_cols
     return ReducedSystem(
         blocks=np.empty((graph.num_blocks, 6, 6)),
-        coupling=np.empty((graph.num_frames, 6, num_border)),
+        coupling=np.empty((graph.num_frames, num_border, 6)),
         border=np.empty((num_border, num_border)),
         right_frames=np.empty((graph.num_frames, 6)),
         right_border=np.empty(num_border),
