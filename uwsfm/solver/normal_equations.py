@@ -1,4 +1,4 @@
-"""Normal equations of the bundle adjustment, and the elimination of the points.
+"""Normal equations of the bundle adjustment, in blocks.
 
 Per cell (one point in one frame) only H = sum J^T J (3x3) by the point in the rig, its
 gradient and its coupling to the border are summed over the cameras. With q the point in
@@ -6,7 +6,7 @@ the rig, the pose enters by M = [-[q]x, I] and the point by the frame's rotation
 
     U += M^T H M,   W = M^T H R,   V += R^T H R
 
-The reduced system is dense: all frames, then the border (rig, ports, lenses).
+The points are eliminated by `uwsfm.solver.schur`.
 """
 
 from typing import NamedTuple
