@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import fused
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.block_graph import BlockGraph, find_block
 from uwsfm.solver.layout import HELD, Layout
@@ -45,7 +45,7 @@ class ReducedSystem(NamedTuple):
     """(P, 3, 3): inverses of the damped point blocks."""
 
 
-@kernel
+@fused
 def invert_damped(block, damping, inverse):
     """Inverse of a symmetric 3x3 with Marquardt damping; False if it is singular."""
     a = block[0, 0] + damping * max(block[0, 0], MIN_DIAGONAL)
@@ -65,7 +65,7 @@ def invert_damped(block, damping, inverse):
     return True
 
 
-@kernel
+@fused
 def invert_points(eqs, damping, first, last, inverses, border, right):
     """Invert the damped blocks of some points, and take them out of the border.
 
@@ -96,7 +96,7 @@ def invert_points(eqs, damping, first, last, inverses, border, right):
                 border[k, m] -= s0 * e[p, 0, m] + s1 * e[p, 1, m] + s2 * e[p, 2, m]
 
 
-@kernel
+@fused
 def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
     """W V^-1 (6, 3) of one cell, and its part of the right side of row i."""
     v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
@@ -111,7 +111,7 @@ def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
         right[i, a] += f0 * g0 + f1 * g1 + f2 * g2
 
 
-@kernel
+@fused
 def _subtract_border(borders, p, i, folded, coupling):
     """Coupling (B, 6) of row i -= E^T (W V^-1)^T."""
     # Six lanes: all that a line needs is loaded before it is stored.
@@ -133,7 +133,7 @@ def _subtract_border(borders, p, i, folded, coupling):
         coupling[i, k, 3], coupling[i, k, 4], coupling[i, k, 5] = b3, b4, b5
 
 
-@kernel
+@fused
 def _subtract_products(
     row_start, row_other, cell_row, first, last, i, cells, folded, blocks
 ):
@@ -162,7 +162,7 @@ def _subtract_products(
             blocks[s, b, 3], blocks[s, b, 4], blocks[s, b, 5] = b3, b4, b5
 
 
-@kernel
+@fused
 def _fill_rows(graph, eqs, damping, first, last, system):
     """Rows as they are before any elimination."""
     blocks, coupling, right = system.blocks, system.coupling, system.right_frames
@@ -178,7 +178,7 @@ def _fill_rows(graph, eqs, damping, first, last, system):
                 coupling[i, k, a] = eqs.frames_border[f, a, k]
 
 
-@kernel
+@fused
 def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
     """Sum the rows of some frames.
 
@@ -214,7 +214,7 @@ def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
                 )
 
 
-@kernel
+@fused
 def substitute_points(
     point_start, graph, eqs, inverses, frames_step, border_step, first, last, out
 ):
