@@ -45,13 +45,11 @@ def _torque(x, y, z, a, b, c):
 
 
 @fused
-def _add_couplings(rows, j, k, num_free, x, y, z, frame, f, sums):
-    """What observation j couples to its camera k: its frame f and its point."""
+def _add_couplings(rows, j, num_free, x, y, z, frame, f, first_col, of_frame, of_point):
+    """What observation j couples to its camera: its frame f and its point."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
-    of_frame, of_point = sums.frames_border, sums.of_point
-    first = k * sums.blocks.shape[1]
     for s in range(num_free):
-        at, col = COUPLING + 3 * s, first + s
+        at, col = COUPLING + 3 * s, first_col + s
         c0, c1, c2 = rows[j, at], rows[j, at + 1], rows[j, at + 2]
         t0, t1, t2 = _torque(x, y, z, c0, c1, c2)
         of_frame[f, col, 0] += t0
@@ -100,7 +98,9 @@ def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
 
 
 @fused
-def add_cell(x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, out):
+def add_cell(
+    x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, cells, grad, v
+):
     """Expand a cell's sums to its frame, its point and their coupling W = M^T H R.
 
     Args:
@@ -108,13 +108,13 @@ def add_cell(x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, out):
         frame: from `rotation`.
         p, c, f: point, cell and frame.
         sums_of_cell: H (lower triangle) and g by the point in the rig, 9 scalars.
-        frames, frames_grad, out: added to; the cell's W is written.
+        frames, frames_grad: of `Sums`, added to.
+        cells, grad, v: of `NormalEquations`; the cell's W is written.
     """
     h00, h10, h11, h20, h21, h22, g0, g1, g2 = sums_of_cell
     t00, t10, t20 = _torque(x, y, z, h00, h10, h20)
     t01, t11, t21 = _torque(x, y, z, h10, h11, h21)
     t02, t12, t22 = _torque(x, y, z, h20, h21, h22)
-    cells = out.cells
     # Literals would compile the function once for each of them.
     row0, row1, row2 = np.int64(0), np.int64(1), np.int64(2)
     row3, row4, row5 = np.int64(3), np.int64(4), np.int64(5)
@@ -132,7 +132,6 @@ def add_cell(x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, out):
     frames_grad[f, 4] += g1
     frames_grad[f, 5] += g2
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
-    grad, v = out.points_grad, out.points
     grad[p, 0] += r11 * g0 + r21 * g1 + r31 * g2
     grad[p, 1] += r12 * g0 + r22 * g1 + r32 * g2
     grad[p, 2] += r13 * g0 + r23 * g1 + r33 * g2
@@ -164,24 +163,34 @@ def _sum_rows(rows, first, last):
 def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
     """Add the rows of an evaluated chunk to the blocks of its points and the sums."""
     rows, in_rig, w = chunk.rows, chunk.in_rig, sums.blocks.shape[1]
+    # Named once, out of the loops: each look into a tuple of arrays counts references.
+    frames, frames_grad, of_frame = sums.frames, sums.frames_grad, sums.frames_border
+    of_point, poses, camera = sums.of_point, state.frames, layout.camera
+    cells, grads, v, border = out.cells, out.points_grad, out.points, out.points_border
+    point_start, cell_start = layout.point_start, layout.cell_start
+    cell_frame, free_start = layout.cell_frame, layout.free_start
+    free_col = layout.free_col
     for p in range(first_point, last_point):
-        for k in range(len(sums.of_point)):
+        for k in range(len(of_point)):
             for a in range(3):
-                sums.of_point[k, a] = 0.0
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            start, end = layout.cell_start[c] - first, layout.cell_start[c + 1] - first
-            f = layout.cell_frame[c]
-            frame = rotation(state.frames, f)
+                of_point[k, a] = 0.0
+        for c in range(point_start[p], point_start[p + 1]):
+            start, end = cell_start[c] - first, cell_start[c + 1] - first
+            f = cell_frame[c]
+            frame = rotation(poses, f)
             x, y, z = in_rig[start, 0], in_rig[start, 1], in_rig[start, 2]
-            cell = _sum_rows(rows, start, end)
-            add_cell(x, y, z, frame, p, c, f, cell, sums.frames, sums.frames_grad, out)
+            total = _sum_rows(rows, start, end)
+            add_cell(
+                x, y, z, frame, p, c, f, total, frames, frames_grad, cells, grads, v
+            )
             for j in range(start, end):
-                k = layout.camera[first + j]
-                num_free = layout.free_start[k + 1] - layout.free_start[k]
-                _add_couplings(rows, j, k, num_free, x, y, z, frame, f, sums)
-        for k in range(len(layout.free_start) - 1):
-            at = layout.free_start[k]
-            for s in range(layout.free_start[k + 1] - at):
-                col = layout.free_col[at + s]
+                k = camera[first + j]
+                num_free = free_start[k + 1] - free_start[k]
+                _add_couplings(
+                    rows, j, num_free, x, y, z, frame, f, k * w, of_frame, of_point
+                )
+        for k in range(len(free_start) - 1):
+            at = free_start[k]
+            for s in range(free_start[k + 1] - at):
                 for a in range(3):
-                    out.points_border[p, a, col] += sums.of_point[k * w + s, a]
+                    border[p, a, free_col[at + s]] += of_point[k * w + s, a]

@@ -124,36 +124,40 @@ def chunk_end(layout, p, end):
 @kernel
 def gather(layout, state, first_point, last_point, chunk):
     """Move the points to the rig and list the observations of each camera."""
-    for k in range(len(chunk.counts)):
-        chunk.counts[k] = 0
-    first = layout.cell_start[layout.point_start[first_point]]
+    counts, bucket, in_rig = chunk.counts, chunk.bucket, chunk.in_rig
+    point_start, cell_start = layout.point_start, layout.cell_start
+    cell_frame, camera = layout.cell_frame, layout.camera
+    frames, points = state.frames, state.points
+    for k in range(len(counts)):
+        counts[k] = 0
+    first = cell_start[point_start[first_point]]
     for p in range(first_point, last_point):
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            x, y, z = point_in_rig(state.frames[layout.cell_frame[c]], state.points[p])
-            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-                j, k = i - first, layout.camera[i]
-                chunk.in_rig[j, 0] = x
-                chunk.in_rig[j, 1] = y
-                chunk.in_rig[j, 2] = z
-                chunk.bucket[k, chunk.counts[k]] = j
-                chunk.counts[k] += 1
+        for c in range(point_start[p], point_start[p + 1]):
+            x, y, z = point_in_rig(frames[cell_frame[c]], points[p])
+            for i in range(cell_start[c], cell_start[c + 1]):
+                j, k = i - first, camera[i]
+                in_rig[j, 0], in_rig[j, 1], in_rig[j, 2] = x, y, z
+                bucket[k, counts[k]] = j
+                counts[k] += 1
     return first
 
 
 @kernel
 def _load(chunk, camera, start, count):
     """Points in the rig of a camera's observations into lanes."""
+    bucket, in_rig, buffer = chunk.bucket, chunk.in_rig, chunk.buffer
     for i in range(BLOCK):
-        j = chunk.bucket[camera, start + min(i, count - 1)]
-        chunk.buffer[X * STRIDE + i] = chunk.in_rig[j, 0]
-        chunk.buffer[Y * STRIDE + i] = chunk.in_rig[j, 1]
-        chunk.buffer[Z * STRIDE + i] = chunk.in_rig[j, 2]
+        j = bucket[camera, start + min(i, count - 1)]
+        buffer[X * STRIDE + i] = in_rig[j, 0]
+        buffer[Y * STRIDE + i] = in_rig[j, 1]
+        buffer[Z * STRIDE + i] = in_rig[j, 2]
 
 
 @kernel
 def evaluate(layout, state, first, chunk):
     """Residuals of a gathered chunk into ``errors``."""
-    errors, buffer = chunk.errors, chunk.buffer
+    errors, buffer, bucket = chunk.errors, chunk.buffer, chunk.bucket
+    xy = layout.xy
     for k in range(len(chunk.counts)):
         cam, lens, port = state.cams[k], state.lenses[k], state.ports[k]
         for start in range(0, chunk.counts[k], BLOCK):
@@ -161,13 +165,13 @@ def evaluate(layout, state, first, chunk):
             _load(chunk, k, start, count)
             project_from_rig(cam, lens, port, buffer)
             for i in range(count):
-                j = chunk.bucket[k, start + i]
+                j = bucket[k, start + i]
                 if buffer[OK * STRIDE + i] == 1.0:
-                    errors[j, 0] = buffer[PX * STRIDE + i] - layout.xy[first + j, 0]
-                    errors[j, 1] = buffer[PY * STRIDE + i] - layout.xy[first + j, 1]
+                    errors[j, 0] = buffer[PX * STRIDE + i] - xy[first + j, 0]
+                    errors[j, 1] = buffer[PY * STRIDE + i] - xy[first + j, 1]
                 else:
                     x, y, z = chunk.in_rig[j]
-                    seen = layout.xy[first + j]
+                    seen = xy[first + j]
                     _, rx, ry = residual(x, y, z, seen, cam, lens, port)
                     errors[j, 0], errors[j, 1] = rx, ry
 
@@ -180,6 +184,7 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
         sums: (C, W, W + 1), added to: each camera against the residual and itself.
     """
     buffer, products = chunk.buffer, chunk.products
+    rows, bucket = chunk.rows, chunk.bucket
     for k in range(len(chunk.counts)):
         num_free = layout.free_start[k + 1] - layout.free_start[k]
         for start in range(0, chunk.counts[k], BLOCK):
@@ -194,19 +199,19 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
             multiply_cells(buffer, products)
             multiply_camera(chunk.columns[k], num_free, sums[k], buffer, products)
             for i in range(count):
-                j = chunk.bucket[k, start + i]
+                j = bucket[k, start + i]
                 for a in range(COUPLING + 3 * num_free):
-                    chunk.rows[j, a] = products[(CELL + a) * STRIDE + i]
+                    rows[j, a] = products[(CELL + a) * STRIDE + i]
 
 
 @kernel
 def _residuals(layout, state, first, k, start, count, chunk):
     """RES_U and RES_V; lanes that are not OK once more, by the scalar kernels."""
-    buffer = chunk.buffer
+    buffer, bucket, xy = chunk.buffer, chunk.bucket, layout.xy
     for i in range(BLOCK):
-        j = chunk.bucket[k, start + min(i, count - 1)]
-        rx = buffer[PX * STRIDE + i] - layout.xy[first + j, 0]
-        ry = buffer[PY * STRIDE + i] - layout.xy[first + j, 1]
+        j = bucket[k, start + min(i, count - 1)]
+        rx = buffer[PX * STRIDE + i] - xy[first + j, 0]
+        ry = buffer[PY * STRIDE + i] - xy[first + j, 1]
         if buffer[OK * STRIDE + i] != 1.0:
             x, y, z = chunk.in_rig[j]
             _, rx, ry = redo_lane(

@@ -156,7 +156,21 @@ def _linearize_in_space(layout, state, error, loss, scale, out):
             lower = (hess[0, 0], hess[1, 0], hess[1, 1], hess[2, 0], hess[2, 1])
             cell = (*lower, hess[2, 2], grad[0], grad[1], grad[2])
             turn = rotation(state.frames, f)
-            add_cell(x, y, z, turn, p, c, f, cell, out.frames, out.frames_grad, out)
+            add_cell(
+                x,
+                y,
+                z,
+                turn,
+                p,
+                c,
+                f,
+                cell,
+                out.frames,
+                out.frames_grad,
+                out.cells,
+                out.points_grad,
+                out.points,
+            )
             _add_couplings(x, y, z, frame, p, f, work.couple, out)
     scatter_blocks(layout, work, out)
 
