@@ -67,9 +67,12 @@ def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
     assert isinstance(refused, InputError) and str(refused) == "number 5 is refused"
     assert [number for number, _ in found] == [0, 1, 2, 3, 4, 6, 7]
     assert os.getpid() not in [process for _, process in found]
-    # What was fatal was done twice, what is wrong once.
+    # What was fatal was done twice, and what is wrong is not tried again for that. A
+    # result that the dead process still held is made once more.
     counts = [len(list(tmp_path.glob(f"{number}-*"))) for number in (3, 4, 5)]
-    assert counts == [2, RETRIES + 1, 1]
+    assert counts[0] == 2
+    assert counts[1] in (RETRIES + 1, RETRIES + 2)
+    assert counts[2] in (1, 2)
 
 
 ORPHANS = """
