@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import surveys
 from child import peak_memory_mb
+from numba.core import event
 from threadpoolctl import threadpool_limits
 
 from uwsfm.calibration.problem import CalibrateOptions
@@ -58,7 +59,7 @@ def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, A
         start.cameras, np.zeros(len(start.cameras), dtype=bool)
     )
     before = peak_memory_mb()
-    messages = _listen()
+    messages, compiled = _listen(), _count_compilations()
     clock = time.process_time()
     layout, state = build_layout(start, columns), State.from_scene(start)
     sorting = time.process_time() - clock
@@ -88,6 +89,7 @@ def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, A
             for found, port in zip(distances, truth.ports, strict=True)
         ],
         "log": sorted(set(messages)),
+        "compiled": len(compiled),
     }
 
 
@@ -161,6 +163,21 @@ def _replaced(owner: Any, name: str, decorate: Callable) -> Iterator[None]:
         yield
     finally:
         setattr(owner, name, original)
+
+
+def _count_compilations() -> list[str]:
+    """Kernels that the cache did not have: the compiler takes memory, too."""
+    names: list[str] = []
+
+    class Ears(event.Listener):
+        def on_start(self, found: event.Event) -> None:
+            names.append(str(found.data["dispatcher"]))
+
+        def on_end(self, found: event.Event) -> None:
+            pass
+
+    event.register("numba:compile", Ears())
+    return names
 
 
 def _listen() -> list[str]:
