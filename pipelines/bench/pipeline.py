@@ -12,6 +12,7 @@ shows that the study runs, not how fast the package is.
 import argparse
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,11 +44,7 @@ def main() -> None:
         print(name, flush=True)
         write_json(machine.watched(sections[name]), work / f"{name}.json")
     results = measured(work, sections)
-    results["targets"] = [
-        {"what": one.what, "target": one.target, "unit": one.unit}
-        | {"measured": one.measured, "met": one.met, "note": one.note}
-        for one in outcomes(results)
-    ]
+    results["targets"] = [{**asdict(o), "met": o.met} for o in outcomes(results)]
     write_json(results, options.out / "bench.json")
     plots.draw(results, options.out)
     text = report.markdown(results)
