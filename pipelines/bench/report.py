@@ -4,10 +4,7 @@ from typing import Any
 
 from kernels import STAGES as KERNEL_STAGES
 from solver import STAGES as SOLVER_STAGES
-from targets import Results, outcomes, solved_sizes
-
-QUIET = 0.2
-"""Cores that other programs may use."""
+from targets import QUIET, Results, outcomes, solved_sizes
 
 
 def markdown(results: Results) -> str:
