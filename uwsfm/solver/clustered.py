@@ -69,7 +69,7 @@ def _scores(layout, state, eqs, inverses, cluster, rows, out):
     j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
     j_border = np.zeros((2, BORDER_SIZE))
     force, grad = np.empty(6), np.empty(BORDER_SIZE)
-    of_point, in_world = np.empty((len(rows), 3)), np.empty(3)
+    of_point, pull = np.empty((len(rows), 3)), np.empty(3)
     for p in range(len(layout.point_start) - 1):
         inverse = inverses[p]
         _reach_of_point(layout, eqs, p, rows, of_point)
@@ -83,20 +83,26 @@ def _scores(layout, state, eqs, inverses, cluster, rows, out):
                 )
                 if status != VALID:
                     continue
-                g = j_rig[0] * rx + j_rig[1] * ry
-                force[0], force[1] = y * g[2] - z * g[1], z * g[0] - x * g[2]
-                force[2], force[3:] = x * g[1] - y * g[0], g
-                grad[:] = j_border[0] * rx + j_border[1] * ry
+                g0 = j_rig[0, 0] * rx + j_rig[1, 0] * ry
+                g1 = j_rig[0, 1] * rx + j_rig[1, 1] * ry
+                g2 = j_rig[0, 2] * rx + j_rig[1, 2] * ry
+                force[0], force[1] = y * g2 - z * g1, z * g0 - x * g2
+                force[2] = x * g1 - y * g0
+                force[3], force[4], force[5] = g0, g1, g2
+                for k in range(BORDER_SIZE):
+                    grad[k] = j_border[0, k] * rx + j_border[1, k] * ry
+                w0 = frame[0] * g0 + frame[4] * g1 + frame[8] * g2
+                w1 = frame[1] * g0 + frame[5] * g1 + frame[9] * g2
+                w2 = frame[2] * g0 + frame[6] * g1 + frame[10] * g2
                 for a in range(3):
-                    in_world[a] = (
-                        frame[a] * g[0] + frame[4 + a] * g[1] + frame[8 + a] * g[2]
+                    pull[a] = (
+                        inverse[a, 0] * w0 + inverse[a, 1] * w1 + inverse[a, 2] * w2
                     )
-                pull, col = inverse @ in_world, layout.frame_col[f]
                 score = out[cluster[i]]
                 _add_score(
                     layout,
                     rows,
-                    col,
+                    layout.frame_col[f],
                     force,
                     pull,
                     grad,

@@ -125,27 +125,45 @@ def _add_products(left, middle, right, twice, out):
 
 
 @kernel
+def _multiply(left, right, out):
+    """(n, 3) times (3, 3)."""
+    for i in range(len(out)):
+        for b in range(3):
+            out[i, b] = (
+                left[i, 0] * right[0, b]
+                + left[i, 1] * right[1, b]
+                + left[i, 2] * right[2, b]
+            )
+
+
+@kernel
 def _point_covariances(point_start, graph, eqs, known, first, last, out):
     """V^-1 + (C V^-1)^T S^-1 (C V^-1) of each point; NaN where V is singular."""
     blocks, coupling, border = known
     cells, points, points_border = eqs.cells, eqs.points, eqs.points_border
     row_start, row_other, cell_row = graph.row_start, graph.row_other, graph.cell_row
-    largest = np.diff(point_start).max()
+    largest = 0
+    for p in range(first, last):
+        largest = max(largest, point_start[p + 1] - point_start[p])
     reach = np.empty((largest, 6, 3))
-    inverse_block = np.empty((3, 3))
+    inverse_block, sideways = np.empty((3, 3)), np.empty((len(border), 3))
     for p in range(first, last):
         if not schur.invert_damped(points[p], 0.0, inverse_block):
-            out[p] = math.nan
+            for a in range(3):
+                for b in range(3):
+                    out[p, a, b] = math.nan
             continue
-        out[p] = inverse_block
-        sideways = np.ascontiguousarray(points_border[p].T) @ inverse_block
+        for a in range(3):
+            for b in range(3):
+                out[p, a, b] = inverse_block[a, b]
+        _multiply(points_border[p].T, inverse_block, sideways)
         _add_products(sideways, border, sideways, False, out[p])
         start = point_start[p]
         for c in range(start, point_start[p + 1]):
             i = cell_row[c]
             if i == HELD:
                 continue
-            reach[c - start] = cells[c] @ inverse_block
+            _multiply(cells[c], inverse_block, reach[c - start])
             _add_products(reach[c - start], coupling[i], sideways, True, out[p])
             s = row_start[i]
             for other in range(start, c + 1):
