@@ -1,9 +1,16 @@
 """Simulated dives as the front end meets them."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
 import numpy as np
+import pycolmap
 
 from uwsfm.colmap import Model
+from uwsfm.demo import sample_dir
 from uwsfm.rig import Rig
+from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.simulate import ObservationOptions, Relief, SimulatedScene, simulate_scene
@@ -26,6 +33,40 @@ def simulated_dive(
             num_points=num_points, noise_px=0.4, detection_rate=0.6, seed=seed
         ),
     )
+
+
+def reduced_images(target: Path, scale: float, num_frames: int | None = None) -> None:
+    """Images of the first frames of the sample, smaller."""
+    for folder in ("left", "right"):
+        (target / folder).mkdir(parents=True)
+        sources = sorted((sample_dir() / "images" / folder).iterdir())
+        for source in sources[:num_frames]:
+            small = cv2.resize(
+                cv2.imread(str(source)),
+                None,
+                fx=scale,
+                fy=scale,
+                interpolation=cv2.INTER_AREA,
+            )
+            cv2.imwrite(str(target / folder / source.with_suffix(".png").name), small)
+
+
+def reduced_rig(scale: float) -> Rig:
+    """The sample's rig, for `reduced_images`."""
+    rig = load_rig(sample_dir() / "rig.yaml")
+    cameras = []
+    for item in rig.cameras:
+        lens = item.camera
+        camera = pycolmap.Camera(
+            model=lens.model_name,
+            width=lens.width,
+            height=lens.height,
+            params=lens.params,
+            has_prior_focal_length=True,
+        )
+        camera.rescale(scale)
+        cameras.append(replace(item, camera=camera))
+    return replace(rig, cameras=tuple(cameras))
 
 
 def model_of(rig: Rig, scene: Scene) -> Model:

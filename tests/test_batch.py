@@ -2,19 +2,17 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import pycolmap
 import pytest
 import yaml
+from sfm_scenes import reduced_images, reduced_rig
 
 from uwsfm.batch import LOG
-from uwsfm.demo import sample_dir
 from uwsfm.dives_file import load_dives
 from uwsfm.errors import InputError
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.rig_file import dump_rig
 
 DIVE = {"name": "bow", "rig": "rig.yaml", "images": "wreck/bow"}
 
@@ -85,29 +83,8 @@ def test_what_is_wrong_with_a_file_is_said_with_its_key(tmp_path, dives, message
 
 def small_dive(folder: Path, num_frames: int, scale: float = 0.4) -> None:
     """The first frames of the sample, reduced, and their rig."""
-    rig = load_rig(sample_dir() / "rig.yaml")
-    cameras = []
-    for item in rig.cameras:
-        (folder / "images" / item.images).mkdir(parents=True)
-        sources = sorted((sample_dir() / "images" / item.images).iterdir())
-        for source in sources[:num_frames]:
-            image = cv2.imread(str(source))
-            small = cv2.resize(
-                image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
-            )
-            target = folder / "images" / item.images / source.with_suffix(".png").name
-            cv2.imwrite(str(target), small)
-        lens = item.camera
-        camera = pycolmap.Camera(
-            model=lens.model_name,
-            width=lens.width,
-            height=lens.height,
-            params=lens.params,
-            has_prior_focal_length=True,
-        )
-        camera.rescale(scale)
-        cameras.append(replace(item, camera=camera))
-    dump_rig(replace(rig, cameras=tuple(cameras)), folder / "rig.yaml", "")
+    reduced_images(folder / "images", scale, num_frames)
+    dump_rig(reduced_rig(scale), folder / "rig.yaml", "")
 
 
 @pytest.mark.slow

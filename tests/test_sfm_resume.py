@@ -11,14 +11,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
+from sfm_scenes import reduced_images, reduced_rig
 
-from uwsfm.demo import sample_dir
 from uwsfm.errors import InputError
 from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.rig_file import dump_rig
 from uwsfm.sfm.background import opened
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 from uwsfm.sfm.perspective import PerspectiveStart, read_start
@@ -55,37 +54,13 @@ perspective_start(
 def image_dir(tmp_path_factory) -> Path:
     """The first frames of the sample, reduced."""
     target = tmp_path_factory.mktemp("images")
-    for folder in ("left", "right"):
-        (target / folder).mkdir()
-        sources = sorted((sample_dir() / "images" / folder).iterdir())[:NUM_FRAMES]
-        for source in sources:
-            small = cv2.resize(
-                cv2.imread(str(source)),
-                None,
-                fx=SCALE,
-                fy=SCALE,
-                interpolation=cv2.INTER_AREA,
-            )
-            cv2.imwrite(str(target / folder / source.with_suffix(".png").name), small)
+    reduced_images(target, SCALE, NUM_FRAMES)
     return target
 
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    rig = load_rig(sample_dir() / "rig.yaml")
-    cameras = []
-    for item in rig.cameras:
-        lens = item.camera
-        camera = pycolmap.Camera(
-            model=lens.model_name,
-            width=lens.width,
-            height=lens.height,
-            params=lens.params,
-            has_prior_focal_length=True,
-        )
-        camera.rescale(SCALE)
-        cameras.append(replace(item, camera=camera))
-    return replace(rig, cameras=tuple(cameras))
+    return reduced_rig(SCALE)
 
 
 @pytest.fixture(scope="module")
