@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import fused
+from uwsfm._jit import fused, lane
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.block_graph import BlockGraph, find_block
 from uwsfm.solver.layout import HELD, Layout
@@ -111,26 +111,42 @@ def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
         right[i, a] += f0 * g0 + f1 * g1 + f2 * g2
 
 
+@lane
+def _columns(folded):
+    """The three columns of W V^-1, six numbers each."""
+    return (
+        (folded[0, 0], folded[1, 0], folded[2, 0]),
+        (folded[3, 0], folded[4, 0], folded[5, 0]),
+        (folded[0, 1], folded[1, 1], folded[2, 1]),
+        (folded[3, 1], folded[4, 1], folded[5, 1]),
+        (folded[0, 2], folded[1, 2], folded[2, 2]),
+        (folded[3, 2], folded[4, 2], folded[5, 2]),
+    )
+
+
+@lane
+def _subtract_line(values, i, k, columns, w0, w1, w2):
+    """values[i, k] (6) -= W V^-1 (w0, w1, w2): all is loaded before it is stored."""
+    (f00, f10, f20), (f30, f40, f50) = columns[0], columns[1]
+    (f01, f11, f21), (f31, f41, f51) = columns[2], columns[3]
+    (f02, f12, f22), (f32, f42, f52) = columns[4], columns[5]
+    b0 = values[i, k, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
+    b1 = values[i, k, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
+    b2 = values[i, k, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
+    b3 = values[i, k, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
+    b4 = values[i, k, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
+    b5 = values[i, k, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
+    values[i, k, 0], values[i, k, 1], values[i, k, 2] = b0, b1, b2
+    values[i, k, 3], values[i, k, 4], values[i, k, 5] = b3, b4, b5
+
+
 @fused
 def _subtract_border(borders, p, i, folded, coupling):
     """Coupling (B, 6) of row i -= E^T (W V^-1)^T."""
-    # Six lanes: all that a line needs is loaded before it is stored.
-    f00, f10, f20 = folded[0, 0], folded[1, 0], folded[2, 0]
-    f30, f40, f50 = folded[3, 0], folded[4, 0], folded[5, 0]
-    f01, f11, f21 = folded[0, 1], folded[1, 1], folded[2, 1]
-    f31, f41, f51 = folded[3, 1], folded[4, 1], folded[5, 1]
-    f02, f12, f22 = folded[0, 2], folded[1, 2], folded[2, 2]
-    f32, f42, f52 = folded[3, 2], folded[4, 2], folded[5, 2]
+    columns = _columns(folded)
     for k in range(coupling.shape[1]):
         w0, w1, w2 = borders[p, 0, k], borders[p, 1, k], borders[p, 2, k]
-        b0 = coupling[i, k, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
-        b1 = coupling[i, k, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
-        b2 = coupling[i, k, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
-        b3 = coupling[i, k, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
-        b4 = coupling[i, k, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
-        b5 = coupling[i, k, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
-        coupling[i, k, 0], coupling[i, k, 1], coupling[i, k, 2] = b0, b1, b2
-        coupling[i, k, 3], coupling[i, k, 4], coupling[i, k, 5] = b3, b4, b5
+        _subtract_line(coupling, i, k, columns, w0, w1, w2)
 
 
 @fused
@@ -138,12 +154,7 @@ def _subtract_products(
     row_start, row_other, cell_row, first, last, i, cells, folded, blocks
 ):
     """Blocks of row i -= W' (W V^-1)^T for the cells W' of a point up to its own."""
-    f00, f10, f20 = folded[0, 0], folded[1, 0], folded[2, 0]
-    f30, f40, f50 = folded[3, 0], folded[4, 0], folded[5, 0]
-    f01, f11, f21 = folded[0, 1], folded[1, 1], folded[2, 1]
-    f31, f41, f51 = folded[3, 1], folded[4, 1], folded[5, 1]
-    f02, f12, f22 = folded[0, 2], folded[1, 2], folded[2, 2]
-    f32, f42, f52 = folded[3, 2], folded[4, 2], folded[5, 2]
+    columns = _columns(folded)
     s = row_start[i]
     for c in range(first, last):
         j = cell_row[c]
@@ -152,14 +163,7 @@ def _subtract_products(
         s = find_block(row_start, row_other, i, j, s)
         for b in range(6):
             w0, w1, w2 = cells[c, b, 0], cells[c, b, 1], cells[c, b, 2]
-            b0 = blocks[s, b, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
-            b1 = blocks[s, b, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
-            b2 = blocks[s, b, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
-            b3 = blocks[s, b, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
-            b4 = blocks[s, b, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
-            b5 = blocks[s, b, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
-            blocks[s, b, 0], blocks[s, b, 1], blocks[s, b, 2] = b0, b1, b2
-            blocks[s, b, 3], blocks[s, b, 4], blocks[s, b, 5] = b3, b4, b5
+            _subtract_line(blocks, s, b, columns, w0, w1, w2)
 
 
 @fused
