@@ -139,8 +139,9 @@ class Problem:
 
     def linearize(self, state: State) -> NormalEquations:
         """Normal equations at a state; the arrays are used again by the next call."""
-        for block in self._eqs:
-            block[...] = 0.0
+        for name, block in self._eqs._asdict().items():
+            if name != "cells":  # the largest; written, not added to
+                block[...] = 0.0
         linearize(
             self.layout,
             state.kernel_state(),

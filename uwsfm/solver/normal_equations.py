@@ -221,7 +221,10 @@ def linearize(
     scale: float,
     out: NormalEquations,
 ) -> None:
-    """Fill zeroed `NormalEquations` at a state, with weights rho'(s)."""
+    """Fill `NormalEquations` at a state, with weights rho'(s).
+
+    All blocks but the cells must be zero before.
+    """
     if error.code != REPROJECTION:
         _linearize_in_space(layout, state, error, loss, scale, out)
         return
