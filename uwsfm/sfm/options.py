@@ -62,9 +62,7 @@ class MatchOptions:
     overlap: int = 10
     """Sequential: neighbours on each side; then those 16, 32, ... frames away."""
     num_similar: int = 5
-    """Sequential: other frames that look most like a frame, which close loops. On 42
-    photographs around a coral, 40 of 42 so meet a frame 11 or more away that sees the
-    same, in a quarter of all pairs; 8 find no more, 3 find 38."""
+    """Sequential: other frames that look most like a frame, which close loops."""
     matcher: Matcher = "colmap"
     """"colmap": its own, without geometry. "paper": nearest neighbours in kd-trees, and
     a tolerant fundamental matrix: half the wrong matches or fewer, at 3 to 6 times the
