@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
+import uwsfm
 from uwsfm.demo import sample_dir
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.rig_file import load_rig
@@ -73,6 +74,17 @@ def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
     assert counts[0] == 2
     assert counts[1] in (RETRIES + 1, RETRIES + 2)
     assert counts[2] in (1, 2)
+
+
+def test_an_address_that_is_none_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(InputError, match="scheduler must be .* got 'nonsense'"):
+        uwsfm.reconstruct(
+            sample_dir() / "rig.yaml",
+            sample_dir() / "images",
+            tmp_path / "out",
+            scheduler="nonsense",
+        )
+    assert not (tmp_path / "out").exists()
 
 
 ORPHANS = """

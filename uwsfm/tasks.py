@@ -68,11 +68,7 @@ class Workers:
         self._folder = folder
         self._client: Client | None = None
         self._resources = ExitStack()
-        if scheduler != LOCAL and "://" not in scheduler:
-            raise InputError(
-                f"scheduler must be 'local' or an address as tcp://host:8786, got "
-                f"{scheduler!r}"
-            )
+        require_address(scheduler)
         if self.elsewhere:
             self._connect()
 
@@ -247,6 +243,19 @@ class Workers:
                     f"worker {worker} does not see {named.absolute()}: every worker "
                     "must have it under the same path"
                 )
+
+
+def require_address(scheduler: str) -> None:
+    """Refuse what is no scheduler, before any work is done.
+
+    Raises:
+        InputError: it is neither "local" nor an address.
+    """
+    if scheduler != LOCAL and "://" not in scheduler:
+        raise InputError(
+            f"scheduler must be 'local' or an address as tcp://host:8786, got "
+            f"{scheduler!r}"
+        )
 
 
 def local_workers() -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from uwsfm.errors import InputError
+from uwsfm.tasks import require_address
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]
@@ -165,6 +166,7 @@ class StartOptions:
             )
         if not 0 <= self.seed <= MAX_SEED:
             raise InputError(f"seed must be between 0 and {MAX_SEED}, got {self.seed}")
+        require_address(self.scheduler)
 
     @property
     def threads(self) -> int:
