@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
+    from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
     from uwsfm.errors import InputError, UwsfmError
     from uwsfm.export.files import export_colmap, export_ply, read_model
@@ -48,6 +49,7 @@ logger.addHandler(logging.NullHandler())
 _HOMES = {
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
+    "Cloud": "uwsfm.cloud",
     "DomePort": "uwsfm.models.port",
     "Distances": "uwsfm.calibration.lengths",
     "Lengths": "uwsfm.calibration.lengths",
@@ -74,17 +76,20 @@ _HOMES = {
     "export_refractive_colmap": "uwsfm.export.refractive_colmap",
     "export_scene_ply": "uwsfm.export.scene_ply",
     "load_rig": "uwsfm.rig_file",
+    "read_cloud": "uwsfm.cloud",
     "read_model": "uwsfm.export.files",
     "read_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
+    "write_cloud": "uwsfm.cloud",
 }
 
 __all__ = [
     "CalibrateOptions",
     "CalibrationResult",
+    "Cloud",
     "Distances",
     "DomePort",
     "FlatPort",
@@ -110,6 +115,7 @@ __all__ = [
     "load_rig",
     "perspective_adjustment",
     "predict_covariance",
+    "read_cloud",
     "read_model",
     "read_refractive_colmap",
     "reconstruct",
@@ -117,6 +123,7 @@ __all__ = [
     "rig_of_refractive_colmap",
     "run_batch",
     "verdicts",
+    "write_cloud",
 ]
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm._files import replaced_dir, replaced_file
+from uwsfm._files import replaced_dir
+from uwsfm._ply import write_ply
 from uwsfm.colmap import (
     Model,
     from_reconstruction,
@@ -102,14 +103,8 @@ def export_ply(
     rows["reprojection_error_px"] = total / np.maximum(count, 1)
     if points_cov is not None:
         rows["depth_stddev_m"] = depth_stddev(model, np.asarray(points_cov, float))
-    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
-    header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment unit: {unit}; made by uwsfm", f"element vertex {len(rows)}"]
-    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
-    with replaced_file(Path(path)) as partial:
-        partial.write_bytes(
-            "\n".join([*header, "end_header\n"]).encode("ascii") + rows.tobytes()
-        )
+    comment = f"unit: {unit}; made by uwsfm"
+    write_ply(Path(path), [("vertex", rows)], comment=comment)
 
 
 def depth_stddev(model: Model, points_cov: Array) -> Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._files import replaced_file
+from uwsfm._ply import write_ply
 from uwsfm.colmap import Model
 from uwsfm.export.files import checked_target
 from uwsfm.geometry import rigid3
@@ -146,16 +146,8 @@ def _write(
     rgb = [(name, "u1") for name in ("red", "green", "blue")]
     rows = _rows([(axis, "<f4") for axis in "xyz"] + rgb, vertices, colors)
     lines = _rows([("vertex1", "<i4"), ("vertex2", "<i4"), *rgb], edges, edge_colors)
-    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
-    header = ["ply", "format binary_little_endian 1.0", f"comment unit: {unit}; uwsfm"]
-    for element, table in (("vertex", rows), ("edge", lines)):
-        header.append(f"element {element} {len(table)}")
-        for name in table.dtype.names or ():
-            kind = table.dtype[name].str.lstrip("|")
-            header.append(f"property {kinds[kind]} {name}")
-    head = "\n".join([*header, "end_header\n"]).encode("ascii")
-    with replaced_file(path) as partial:
-        partial.write_bytes(head + rows.tobytes() + lines.tobytes())
+    tables = [("vertex", rows), ("edge", lines)]
+    write_ply(path, tables, comment=f"unit: {unit}; uwsfm")
 
 
 def _rows(

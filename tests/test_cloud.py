@@ -1,0 +1,65 @@
+"""Clouds and their file, against Open3D's reader."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwsfm.cloud import Cloud, read_cloud, unit_of_cloud, write_cloud
+from uwsfm.errors import InputError
+
+
+def random_cloud(rng: np.random.Generator, count: int) -> Cloud:
+    return Cloud(
+        # Far from the origin: single precision would lose the millimetres.
+        points=rng.normal(size=(count, 3)) + 4e5,
+        normals=rng.normal(size=(count, 3)),
+        colors=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        stddev=rng.uniform(size=count),
+        num_views=rng.integers(1, 9, count),
+        view_range=rng.uniform(1.0, 3.0, count),
+    )
+
+
+def test_a_cloud_comes_back_from_its_file(tmp_path: Path, rng: np.random.Generator):
+    cloud, path = random_cloud(rng, 100), tmp_path / "new" / "cloud.ply"
+    write_cloud(cloud, path, "baseline")
+    back = read_cloud(path)
+    for name, values in vars(cloud).items():
+        assert getattr(back, name).dtype == values.dtype
+        # Only positions are stored in double precision.
+        tolerance = 0.0 if name == "points" else 1e-6
+        np.testing.assert_allclose(getattr(back, name), values, tolerance, 0.0)
+    assert unit_of_cloud(path) == "baseline"
+    assert len(back.select(back.num_views > 4)) == np.count_nonzero(back.num_views > 4)
+
+
+def test_open3d_reads_the_same(tmp_path: Path, rng: np.random.Generator, open3d):
+    cloud, path = random_cloud(rng, 100), tmp_path / "cloud.ply"
+    write_cloud(cloud, path)
+    read = open3d.t.io.read_point_cloud(str(path)).point
+    np.testing.assert_array_equal(read["positions"].numpy(), cloud.points)
+    np.testing.assert_array_equal(read["colors"].numpy(), cloud.colors)
+    np.testing.assert_array_equal(read["num_views"].numpy()[:, 0], cloud.num_views)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot read"),
+        (b"solid\n", "not a PLY file"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "little-endian"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+            b"property float x\nend_header\n0000",
+            "holds 1 of its 2 vertices",
+        ),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path: Path, content, message: str):
+    path = tmp_path / "cloud.ply"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cloud(path)
+    assert str(path) in str(caught.value)

@@ -1,0 +1,122 @@
+"""`Cloud`: dense points with what is known of each, and its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uwsfm._ply import read_vertices, write_ply
+from uwsfm.errors import InputError
+from uwsfm.geometry.rigid3 import Array
+
+_COLUMNS = (
+    *((name, "<f8") for name in ("x", "y", "z")),
+    *((name, "<f4") for name in ("nx", "ny", "nz")),
+    *((name, "u1") for name in ("red", "green", "blue")),
+    ("stddev", "<f4"),
+    ("num_views", "<i4"),
+    ("view_range", "<f4"),
+)
+_UNIT = "unit: "
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """N points on surfaces, in the world frame of a reconstruction, metres.
+
+    Raises:
+        InputError: arrays of different lengths.
+    """
+
+    points: Array
+    """(N, 3)"""
+    normals: Array
+    """(N, 3) unit, towards the cameras that saw the point; NaN if undetermined."""
+    colors: NDArray[np.uint8]
+    """(N, 3) RGB"""
+    stddev: Array
+    """(N,) along the line of sight, metres; NaN if undetermined."""
+    num_views: NDArray[np.int64]
+    """(N,) depth maps that agree on the point."""
+    view_range: Array
+    """(N,) distance from the camera that gives the colour, through the water; NaN if
+    unknown."""
+
+    def __post_init__(self) -> None:
+        shapes = {"points": (3,), "normals": (3,), "colors": (3,)}
+        shapes |= {"stddev": (), "num_views": (), "view_range": ()}
+        for name, tail in shapes.items():
+            shape, expected = getattr(self, name).shape, (len(self.points), *tail)
+            if shape != expected:
+                raise InputError(f"cloud {name} has shape {shape}, expected {expected}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: ArrayLike) -> Cloud:
+        """The points of a mask (N,) or of indices."""
+        rows = np.asarray(keep)
+        return Cloud(**{name: value[rows] for name, value in vars(self).items()})
+
+
+def write_cloud(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
+    """Write a binary PLY.
+
+    Properties: x y z (double, world), nx ny nz (float), red green blue (uchar), stddev
+    (float), num_views (int), view_range (float).
+
+    Args:
+        cloud: what to write.
+        path: the file.
+        unit: of all lengths, for the comment in the file.
+    """
+    table = np.empty(len(cloud), dtype=list(_COLUMNS))
+    columns = [*cloud.points.T, *cloud.normals.T, *cloud.colors.T]
+    columns += [cloud.stddev, cloud.num_views, cloud.view_range]
+    for (name, _), values in zip(_COLUMNS, columns, strict=True):
+        table[name] = values
+    write_ply(Path(path), [("vertex", table)], comment=f"{_UNIT}{unit}; uwsfm dense")
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Read a file of `write_cloud`, or the vertices of any binary PLY.
+
+    What the file does not hold is NaN; colours are then grey, views one.
+
+    Raises:
+        InputError: the file is not there, no such PLY, or without x, y and z.
+    """
+    table, _ = read_vertices(Path(path))
+    names = table.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path}: its vertices have no x, y and z")
+
+    def columns(wanted: tuple[str, ...], default: float) -> np.ndarray:
+        if not set(wanted) <= set(names):
+            return np.full((len(table), len(wanted)), default)
+        return np.stack([table[name] for name in wanted], axis=1)
+
+    return Cloud(
+        points=columns(("x", "y", "z"), np.nan).astype(np.float64),
+        normals=columns(("nx", "ny", "nz"), np.nan).astype(np.float64),
+        colors=columns(("red", "green", "blue"), 128).astype(np.uint8),
+        stddev=columns(("stddev",), np.nan)[:, 0].astype(np.float64),
+        num_views=columns(("num_views",), 1)[:, 0].astype(np.int64),
+        view_range=columns(("view_range",), np.nan)[:, 0].astype(np.float64),
+    )
+
+
+def unit_of_cloud(path: str | Path) -> str:
+    """What the lengths of a cloud file are in, by its comment; "metre" without one.
+
+    Raises:
+        InputError: the file is not there, or no such PLY.
+    """
+    _, comments = read_vertices(Path(path))
+    for comment in comments:
+        if comment.startswith(_UNIT):
+            return comment[len(_UNIT) :].split(";")[0]
+    return "metre"
