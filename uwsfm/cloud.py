@@ -46,8 +46,10 @@ class Cloud:
     unknown."""
 
     def __post_init__(self) -> None:
-        shapes = {"points": (3,), "normals": (3,), "colors": (3,)}
-        shapes |= {"stddev": (), "num_views": (), "view_range": ()}
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("points", "normals", "colors"), (3,)
+        )
+        shapes |= dict.fromkeys(("stddev", "num_views", "view_range"), ())
         for name, tail in shapes.items():
             shape, expected = getattr(self, name).shape, (len(self.points), *tail)
             if shape != expected:
