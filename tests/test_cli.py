@@ -25,6 +25,7 @@ COMMANDS = [
     ["reconstruct"],
     ["demo"],
     ["batch"],
+    ["clean"],
     ["export"],
     ["simulate"],
     ["simulate", "images"],

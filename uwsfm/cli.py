@@ -27,6 +27,7 @@ from uwsfm.cli_options import (
     wanted_of,
 )
 from uwsfm.cli_simulate import simulate_app
+from uwsfm.cli_surface import clean
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
+app.command()(clean)
 
 FAILED, WRONG_INPUT = 1, 2
 

@@ -13,15 +13,19 @@ if TYPE_CHECKING:
 
 def export(
     model: Annotated[
-        Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
+        Path,
+        typer.Argument(
+            metavar="OUT", help="The output of uwsfm reconstruct; las, laz: or a PLY."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder or file to write.")],
     to: Annotated[
-        Literal["pinhole", "refractive-colmap", "ply"],
+        Literal["pinhole", "refractive-colmap", "ply", "las", "laz"],
         typer.Option(
             help="pinhole: a central COLMAP model for stock tools, without refraction; "
             "refractive-colmap: the text format of Refractive COLMAP; "
-            "ply: points, cameras and ports in one file."
+            "ply: points, cameras and ports in one file; las, laz: the dense cloud, or "
+            "the points if there is none."
         ),
     ],
     images: Annotated[
@@ -37,6 +41,12 @@ def export(
 
     if images is not None and to != "pinhole":
         raise InputError(f"--images: --to {to} writes no images")
+    if to in ("las", "laz"):
+        from uwsfm.surface.commands import export_las
+
+        cloud = export_las(model, out, to)
+        typer.echo(f"wrote {out}: {len(cloud)} points")
+        return
     found = read_model(model)
     if to == "pinhole":
         _export_pinhole(found, out, images)

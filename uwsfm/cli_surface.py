@@ -1,0 +1,89 @@
+"""Clouds, meshes, maps and colour."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+SourceArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OUT_OR_CLOUD",
+        help="A result folder (its dense cloud, or its points if there is none), or a "
+        "PLY file.",
+    ),
+]
+
+
+def clean(
+    source: SourceArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The PLY file to write.")],
+    min_views: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Images of a track (default 3), or depth maps that agree (2).",
+            show_default=False,
+        ),
+    ] = None,
+    max_error_px: Annotated[
+        float | None,
+        typer.Option(help="Mean reprojection error (default 2).", show_default=False),
+    ] = None,
+    max_stddev: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Along the line of sight (default: any).",
+            show_default=False,
+        ),
+    ] = None,
+    max_relative_stddev: Annotated[
+        float | None,
+        typer.Option(
+            help="The same, as a share of the distance (default 0.02).",
+            show_default=False,
+        ),
+    ] = None,
+    outlier_ratio: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviations that a point may be further from its neighbours "
+            "than others from theirs (default 4).",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Leave out the bad points of a cloud, and count them. inf switches a limit off."""
+    from uwsfm.surface.commands import clean_cloud
+
+    limits: dict[str, Any] = {
+        "min_views": min_views,
+        "max_error_px": max_error_px,
+        "max_stddev_m": max_stddev,
+        "max_relative_stddev": max_relative_stddev,
+        "outlier_ratio": outlier_ratio,
+    }
+    given = {name: value for name, value in limits.items() if value is not None}
+    report = clean_cloud(source, out, **given)
+    _print_filters(report)
+    typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
+
+
+def _print_filters(report: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    from uwsfm.console import console
+
+    table = Table(title="Points left out", title_justify="left")
+    table.add_column("by", no_wrap=True)
+    for column in ("limit", "tested", "left out", "of these unknown"):
+        table.add_column(column, justify="right")
+    for item in report["filters"]:
+        limit = "" if item["limit"] is None else f"{item['limit']:g}"
+        counts = (item[f"num_{key}"] for key in ("tested", "removed", "unknown"))
+        table.add_row(item["name"], limit, *map(str, counts))
+    table.add_section()
+    kept, count = report["num_kept"], report["num_points"]
+    table.add_row("all", "", str(count), str(count - kept), "")
+    console.print(table)

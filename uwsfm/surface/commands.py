@@ -1,0 +1,92 @@
+"""What `uwsfm clean`, `mesh` and `map` do."""
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwsfm._ply import write_ply
+from uwsfm.cloud import Cloud
+from uwsfm.errors import InputError
+from uwsfm.export.files import checked_target
+from uwsfm.export.summary import write_json
+from uwsfm.surface.clean import clean_points, default_options
+from uwsfm.surface.las import write_las
+from uwsfm.surface.source import find_source
+
+
+def clean_cloud(
+    source: str | Path, path: str | Path, **limits: float
+) -> dict[str, Any]:
+    """Write the good points of a cloud, all their columns kept.
+
+    A JSON file of the same name holds what each filter removed.
+
+    Args:
+        source: result folder, or a PLY of its.
+        path: the PLY to write; must not exist.
+        limits: fields of `uwsfm.surface.clean.CleanOptions`, by default those of
+            `default_options`; infinity leaves a filter out.
+
+    Returns:
+        What the JSON file holds.
+
+    Raises:
+        InputError: nothing to read, something to write over, or a limit on what the
+            cloud does not hold.
+    """
+    target = checked_target(path)
+    if target.suffix != ".ply":
+        raise InputError(f"{target}: the name of a cleaned cloud must end in .ply")
+    report_path = checked_target(target.with_suffix(".json"))
+    found = find_source(source)
+    table = found.table()
+    wants_range = limits.get("max_relative_stddev") != math.inf
+    ranges = None
+    if found.is_sparse and wants_range:
+        ranges = found.sparse_ranges(len(table))
+    wanted: dict[str, Any] = {
+        name: None if value == math.inf else value for name, value in limits.items()
+    }
+    options = replace(default_options(table, ranges), **wanted)
+    keep, filters = clean_points(table, options, ranges)
+    if not np.any(keep):
+        worst = max(filters, key=lambda item: item.num_removed)
+        raise InputError(
+            f"{found.path}: no point is left, {worst.num_removed} of {len(table)} "
+            f"failed at '{worst.name}'"
+        )
+    report = {
+        "source": str(found.path),
+        "unit": found.unit,
+        "num_points": len(table),
+        "num_kept": int(np.count_nonzero(keep)),
+        "filters": [asdict(item) for item in filters],
+    }
+    comment = f"unit: {found.unit}; made by uwsfm clean"
+    write_ply(target, [("vertex", table[keep])], comment=comment)
+    write_json(report, report_path)
+    return report
+
+
+def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
+    """Write a cloud as LAS or LAZ; see `uwsfm.surface.las`.
+
+    Args:
+        source: result folder, or a PLY of its.
+        path: the file to write; must not exist.
+        suffix: "las" or "laz", which ends the file's name.
+
+    Raises:
+        InputError: nothing to read, or something to write over.
+        MissingPackageError: laspy is missing.
+    """
+    target = checked_target(path)
+    if target.suffix.lower() != f".{suffix}":
+        raise InputError(f"{target}: the name of a file for --to {suffix} ends in it")
+    found = find_source(source)
+    cloud = found.cloud()
+    write_las(cloud, target, found.unit)
+    return cloud
