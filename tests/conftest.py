@@ -5,6 +5,7 @@ from zlib import crc32
 
 import numpy as np
 import pytest
+from result_folders import DiveResult, refined_dive
 
 from uwsfm.errors import MissingPackageError
 
@@ -24,3 +25,9 @@ def open3d() -> ModuleType:
         return import_open3d()
     except MissingPackageError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def dive_result(tmp_path_factory: pytest.TempPathFactory) -> DiveResult:
+    """A simulated dive with a clicked scale bar, refined; tests must not change it."""
+    return refined_dive(tmp_path_factory.mktemp("dive"))

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from uwsfm.models.status import Status
     from uwsfm.pipeline import reconstruct
     from uwsfm.refine_pipeline import refine_model
+    from uwsfm.result_folder import Result, open_result
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
@@ -80,6 +81,8 @@ _HOMES = {
     "read_model": "uwsfm.export.files",
     "read_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
+    "Result": "uwsfm.result_folder",
+    "open_result": "uwsfm.result_folder",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
@@ -99,6 +102,7 @@ __all__ = [
     "NoPort",
     "Positions",
     "RefractiveCamera",
+    "Result",
     "Rig",
     "Scene",
     "Status",
@@ -113,6 +117,7 @@ __all__ = [
     "export_refractive_colmap",
     "export_scene_ply",
     "load_rig",
+    "open_result",
     "perspective_adjustment",
     "predict_covariance",
     "read_cloud",

@@ -17,6 +17,7 @@ from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
@@ -37,6 +38,7 @@ from uwsfm.export.summary import (
 )
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
+from uwsfm.result_folder import recorded_images, store_calibration
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
@@ -106,8 +108,9 @@ def reconstruct(
     Args:
         rig: A rig, or the path of a rig file.
         images: Folder that holds one folder of images per camera.
-        out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply`` and
-            ``summary.json``, each replaced as a whole.
+        out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply``,
+            ``calibration.npz`` and ``summary.json``, each replaced as a whole;
+            `uwsfm.open_result` reads it.
         clahe: Equalise contrast locally before the search for features.
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
@@ -184,8 +187,9 @@ class _Job:
         export_colmap(model, out / SPARSE)
         export_housing(model.rig, out / HOUSING, refined.calibration)
         export_points(model, out / POINTS, refined.calibration)
+        store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
-        summary = _summary(model, start, refined, timings)
+        summary = _summary(model, start, refined, timings, self.images)
         write_json(summary, out / SUMMARY)
         return ReconstructResult(
             model=model,
@@ -240,7 +244,7 @@ def output_folder(out: str | Path) -> Path:
         raise InputError(f"{out} is a file, not a folder for results")
     if _made_by_us(out):
         return out
-    for name in (SPARSE, HOUSING, POINTS, SUMMARY, WORK):
+    for name in (SPARSE, HOUSING, POINTS, CALIBRATION, SUMMARY, WORK):
         if (out / name).exists():
             raise InputError(
                 f"{out / name} exists and was not made by uwsfm: choose another folder"
@@ -314,6 +318,7 @@ def _summary(
     start: Start,
     refined: Refined,
     timings: dict[str, float],
+    images: Path,
 ) -> dict[str, Any]:
     mapped = dict(start.summary)
     cameras = housing_summary(model.rig, refined.calibration)
@@ -335,6 +340,7 @@ def _summary(
         "baseline_stddev_m": model.rig.baseline_stddev_m,
         f"{start.kind}_start": mapped,
         "warnings": warnings,
+        "images": recorded_images(images),
         "timings_s": timings,
         "versions": versions(),
     }

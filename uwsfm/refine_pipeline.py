@@ -41,6 +41,7 @@ from uwsfm.pipeline import (
     refined_rig,
     require_effect,
 )
+from uwsfm.result_folder import recorded_images, store_calibration
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
@@ -106,8 +107,9 @@ def refine_model(
         source: Folder of the model, or one that holds it: of ``sparse/0``, ``sparse/1``
             the largest is taken.
         rig: A rig, or the path of a rig file; its ports are the initial values.
-        out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply`` and
-            ``summary.json``, each replaced as a whole.
+        out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply``,
+            ``calibration.npz`` and ``summary.json``, each replaced as a whole;
+            `uwsfm.open_result` reads it.
         images: Folder that holds one folder of images per camera, to colour the points;
             without it they keep the colours of the model, and what only the database
             has is black.
@@ -221,6 +223,7 @@ class _Job:
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, refined.calibration)
         export_points(model, self.out / POINTS, refined.calibration)
+        store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
         write_json(summary, self.out / SUMMARY)
@@ -332,6 +335,7 @@ class _Job:
                 "refractive_error_of_common_px": _mean(error),
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
+            "images": recorded_images(self.images),
             "timings_s": self.timings,
             "versions": versions(),
         }
@@ -354,11 +358,27 @@ def _without_empty_frames(refined: Refined) -> tuple[Refined, NDArray[np.int64]]
     covariance = replace(
         calibration.covariance, frames=calibration.covariance.frames[frames]
     )
-    positions = calibration.positions
+    positions, entered = calibration.positions, calibration.entered
+    bars = calibration.bars
     calibration = replace(
         calibration,
         scene=smaller,
         covariance=covariance,
         positions=None if positions is None else positions.in_frames(frames),
+        entered=None if entered is None else entered.in_frames(frames),
+        bars=None if bars is None else _in_frames(bars, frames),
     )
     return replace(refined, scene=smaller, calibration=calibration), frames
+
+
+def _in_frames(bars: Scene, frames: NDArray[np.int64]) -> Scene:
+    """Clicks in some frames only, numbered as they are there; every point stays."""
+    there = np.isin(bars.frame_idx, frames)
+    return replace(
+        bars,
+        rig_from_world=bars.rig_from_world[frames],
+        camera_idx=bars.camera_idx[there],
+        frame_idx=np.searchsorted(frames, bars.frame_idx[there]),
+        point_idx=bars.point_idx[there],
+        xy=bars.xy[there],
+    )

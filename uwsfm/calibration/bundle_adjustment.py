@@ -101,6 +101,7 @@ def _result(run: Run, solved: Solved, seconds: float) -> CalibrationResult:
         options=run.settings,
         lengths=outside.length_fit(solved.state),
         positions=outside.position_fit(solved.state, posterior.navigation),
+        entered=outside.entered(),
     )
 
 

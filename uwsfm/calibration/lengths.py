@@ -153,6 +153,27 @@ class Lengths:
         clicked = np.cumsum(keep)[self.clicked] - 1
         return replace(self, between_points=bars, clicked=clicked)
 
+    def in_frames(self, frames: IndexArray) -> "Lengths":
+        """What speaks of some frames (F',) only, numbered as they are there."""
+        between, known = self.between_frames, self.positions
+        if between is not None:
+            there = np.isin(between.ends, frames).all(axis=1)
+            between = replace(
+                between,
+                ends=np.searchsorted(frames, between.ends[there]),
+                lengths_m=between.lengths_m[there],
+                stddevs_m=between.stddevs_m[there],
+            )
+        if known is not None:
+            there = np.isin(known.frame_idx, frames)
+            known = replace(
+                known,
+                frame_idx=np.searchsorted(frames, known.frame_idx[there]),
+                positions=known.positions[there],
+                covariances=known.covariances[there],
+            )
+        return replace(self, between_frames=between, positions=known)
+
     def checked(self, scene: Scene) -> "Lengths":
         """These lengths, if a scene has what they speak of.
 

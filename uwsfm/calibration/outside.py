@@ -345,6 +345,21 @@ class Outside:
             covariance=covariance,
         )
 
+    def entered(self) -> Lengths | None:
+        """The lengths as the last solve weighed them; None without any."""
+        if not self.lengths.give_scale:
+            return None
+        known = self.lengths.positions
+        if known is not None:
+            keep = self.inliers & self.present
+            known = replace(
+                known,
+                frame_idx=known.frame_idx[keep],
+                positions=known.positions[keep],
+                covariances=self.scatter**2 * known.covariances[keep],
+            )
+        return replace(self.lengths, positions=known)
+
     def nav_from_world(self, state: State) -> Array:
         """(7,) the world's place in the frame of the positions."""
         nav = state.nav_from_world

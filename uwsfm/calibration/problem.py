@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.lengths import LengthFit, PositionFit
+from uwsfm.calibration.lengths import LengthFit, Lengths, PositionFit
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
@@ -332,3 +332,9 @@ class CalibrationResult:
     lengths: LengthFit | None = None
     positions: PositionFit | None = None
     """Then the scene is in the frame of the positions."""
+    entered: Lengths | None = field(default=None, repr=False)
+    """The lengths as the last solve weighed them: positions that were believed, with
+    their covariances enlarged by how much they scatter. None without any."""
+    bars: Scene | None = field(default=None, repr=False)
+    """Clicked ends of scale bars that took part and are not in ``scene``: ``entered``
+    counts these points after those of ``scene``."""

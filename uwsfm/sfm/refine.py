@@ -110,14 +110,15 @@ def refine_scene(
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     check_clicks(given, scene)
     second = solve(scene, keep)
-    found = second.inliers & ~np.isin(np.nonzero(keep)[0], given.clicked)
+    clicks = np.isin(np.nonzero(keep)[0], given.clicked)
+    found = second.inliers & ~clicks
     kept = np.nonzero(keep)[0][found]
     final, still = second.scene.select(found)
     before = start.residuals()[kept]
     return Refined(
         scene=final,
         kept=kept,
-        calibration=_compact(second, final, still),
+        calibration=_compact(second, final, still, clicks),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
     )
 
@@ -185,13 +186,36 @@ def _require(keep: NDArray[np.bool_], scene: Scene) -> NDArray[np.bool_]:
 
 
 def _compact(
-    result: CalibrationResult, scene: Scene, used: IndexArray
+    result: CalibrationResult,
+    scene: Scene,
+    used: IndexArray,
+    clicks: NDArray[np.bool_],
 ) -> CalibrationResult:
-    """A result in the numbering of the scene that kept its inliers only."""
+    """A result in the numbering of the scene that kept its inliers only.
+
+    Args:
+        result: of the larger scene.
+        scene: which has only features.
+        used: (P',) index of each of its points in the larger one.
+        clicks: (N,) observations of the larger one that are ends of scale bars.
+    """
     covariance = replace(result.covariance, points=result.covariance.points[used])
+    entered, bars = result.entered, None
+    if entered is not None and entered.between_points is not None and clicks.any():
+        bars, ends = result.scene.select(clicks)
+        known = entered.between_points
+        first = scene.num_points + np.searchsorted(ends, known.ends)
+        entered = replace(
+            entered,
+            between_points=replace(known, ends=first),
+            clicked=np.empty(0, dtype=np.int64),
+            click_stddevs_px=None,
+        )
     return replace(
         result,
         scene=scene,
         inliers=np.ones(scene.num_observations, dtype=bool),
         covariance=covariance,
+        entered=entered,
+        bars=bars,
     )

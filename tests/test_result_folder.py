@@ -1,0 +1,134 @@
+"""Output folders read again: everything that was found, or one clear sentence."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import uwsfm
+from uwsfm import InputError
+from uwsfm.pipeline import output_folder
+
+
+def assert_same(found, expected):
+    """Two calibrations, or parts of them, array by array."""
+    if dataclasses.is_dataclass(expected):
+        for field in dataclasses.fields(expected):
+            pair = (getattr(part, field.name) for part in (found, expected))
+            assert_same(*pair)
+    elif isinstance(expected, np.ndarray):
+        np.testing.assert_array_equal(found, expected)
+    elif isinstance(expected, tuple):
+        assert len(found) == len(expected)
+        for pair in zip(found, expected, strict=True):
+            assert_same(*pair)
+    else:
+        assert found == expected
+
+
+def test_what_was_found_is_read_again(dive_result):
+    result = uwsfm.open_result(dive_result.out)
+    assert result.unit == "metre" and result.images is None
+    assert result.summary == json.loads(json.dumps(dive_result.result.summary))
+    expected, found = dive_result.result.calibration, result.calibration
+    # The COLMAP model has the observations in another order, and renormalised poses.
+    for name in ("summary", "covariance", "options", "lengths", "entered"):
+        assert_same(getattr(found, name), getattr(expected, name))
+    assert found.scene is result.model.scene and np.all(found.inliers)
+    np.testing.assert_array_equal(found.scene.points, expected.scene.points)
+    np.testing.assert_array_equal(found.bars.points, expected.bars.points)
+    np.testing.assert_array_equal(found.bars.xy, expected.bars.xy)
+    np.testing.assert_array_equal(found.bars.frame_idx, expected.bars.frame_idx)
+    # The ends of the bar count after the points of the model.
+    assert found.entered.between_points.ends.min() == found.scene.num_points
+
+
+def _without_calibration(out):
+    (out / "calibration.npz").unlink()
+
+
+def _cut_short(out):
+    data = (out / "calibration.npz").read_bytes()
+    (out / "calibration.npz").write_bytes(data[: len(data) // 2])
+
+
+def _of_another_run(out):
+    housing = out / "housing.yaml"
+    housing.write_text(
+        housing.read_text().replace("thickness_m: 0.02", "thickness_m: 0.03")
+    )
+
+
+def _of_another_format(out):
+    with np.load(out / "calibration.npz") as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays["about"]))
+    arrays["about"] = json.dumps({**about, "version": 9})
+    np.savez(out / "calibration.npz", **arrays)
+
+
+def _of_another_size(out):
+    with np.load(out / "calibration.npz") as file:
+        arrays = dict(file)
+    np.savez(out / "calibration.npz", **{**arrays, "points": arrays["points"][:-1]})
+
+
+def _without_summary(out):
+    (out / "summary.json").unlink()
+
+
+def _damaged_summary(out):
+    (out / "summary.json").write_text('{"versions": ')
+
+
+def _without_model(out):
+    shutil.rmtree(out / "sparse")
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (_without_calibration, "calibration.npz is missing: an earlier version"),
+        (_cut_short, "calibration.npz is damaged: run the command"),
+        (_of_another_run, "is of another model than the one beside it"),
+        (_of_another_format, "has format 9, this version of uwsfm reads 1"),
+        (_of_another_size, "calibration.npz is damaged"),
+        (_without_summary, "summary.json is missing: the run has not finished"),
+        (_damaged_summary, "summary.json is damaged"),
+        (_without_model, "sparse: no such COLMAP model folder"),
+    ],
+)
+def test_damaged_folders_are_told_in_one_sentence(dive_result, tmp_path, harm, words):
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    harm(out)
+    with pytest.raises(InputError, match=words) as error:
+        uwsfm.open_result(out)
+    assert "\n" not in str(error.value) and str(out) in str(error.value)
+
+
+def test_images_are_where_they_were_or_where_one_says(dive_result, tmp_path):
+    out, images = tmp_path / "out", tmp_path / "images"
+    shutil.copytree(dive_result.out, out)
+    summary = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps({**summary, "images": str(images)}))
+    gone = uwsfm.open_result(out)
+    assert gone.images is None
+    with pytest.raises(InputError, match="say with --images where they are"):
+        gone.require_images()
+    (images / "left").mkdir(parents=True)
+    assert uwsfm.open_result(out).require_images() == images
+    with pytest.raises(InputError, match="lacks left/0000.jpg"):
+        uwsfm.open_result(out, images=images)
+    (images / "left" / "0000.jpg").write_bytes(b"")
+    assert uwsfm.open_result(out, images=images).images == images
+    with pytest.raises(InputError, match="no such folder of images"):
+        uwsfm.open_result(out, images=tmp_path / "elsewhere")
+
+
+def test_a_foreign_calibration_is_not_overwritten(tmp_path):
+    (tmp_path / "calibration.npz").write_bytes(b"of someone else")
+    with pytest.raises(InputError, match=r"calibration\.npz exists and was not made"):
+        output_folder(tmp_path)

@@ -1,0 +1,121 @@
+"""The folder that `uwsfm reconstruct`, `refine` and `demo` leave, read again."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.colmap import Model
+from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import (
+    CALIBRATION,
+    RUN_AGAIN,
+    fingerprint,
+    read_calibration,
+    write_calibration,
+)
+from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """A reconstruction and all that is known of it."""
+
+    folder: Path
+    model: Model
+    calibration: CalibrationResult
+    """Of ``model.scene``: every observation there is an inlier."""
+    summary: dict[str, Any]
+    """summary.json"""
+    images: Path | None
+    """Folder that holds one folder of images per camera; None if it is not known, or
+    no longer there."""
+
+    @property
+    def unit(self) -> str:
+        """Of all lengths: "metre" or "scale arbitrary"."""
+        arbitrary = self.calibration.covariance.scale_stddev is None
+        return "scale arbitrary" if arbitrary else "metre"
+
+    def require_images(self) -> Path:
+        """The folder of the images.
+
+        Raises:
+            InputError: it is not known; says what to do.
+        """
+        if self.images is not None:
+            return self.images
+        recorded = self.summary.get("images")
+        where = "it is not known where" if recorded is None else f"not at {recorded}"
+        raise InputError(
+            f"the images of {self.folder} are missing ({where}): say with --images "
+            "where they are"
+        )
+
+
+def open_result(out: str | Path, images: str | Path | None = None) -> Result:
+    """Read an output folder, covariances included.
+
+    Args:
+        out: folder that `reconstruct`, `refine_model` or `run_demo` wrote.
+        images: where the images are now; default: where they were.
+
+    Raises:
+        InputError: one sentence, if the folder is not such a one, a file is missing or
+            damaged, the files are of different runs, or ``images`` lacks an image.
+    """
+    folder = Path(out)
+    summary_path = folder / SUMMARY
+    model = read_model(folder)
+    try:
+        summary = json.loads(summary_path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(
+            f"{summary_path} is missing: the run has not finished; {RUN_AGAIN}"
+        ) from None
+    except (OSError, ValueError):
+        summary = None
+    if not isinstance(summary, dict):
+        raise InputError(f"{summary_path} is damaged: {RUN_AGAIN}")
+    mark = fingerprint(folder / SPARSE, folder / HOUSING)
+    calibration = read_calibration(folder / CALIBRATION, model.scene, mark)
+    return Result(
+        folder=folder,
+        model=model,
+        calibration=calibration,
+        summary=summary,
+        images=_image_folder(model, images, summary.get("images")),
+    )
+
+
+def store_calibration(calibration: CalibrationResult, out: Path) -> None:
+    """Write calibration.npz beside the model and the housing that are there."""
+    mark = fingerprint(out / SPARSE, out / HOUSING)
+    write_calibration(calibration, out / CALIBRATION, mark)
+
+
+def recorded_images(images: Path | None) -> str | None:
+    """What summary.json says of the images."""
+    return None if images is None else str(images.absolute())
+
+
+def _image_folder(
+    model: Model, given: str | Path | None, recorded: object
+) -> Path | None:
+    if given is None:
+        found = Path(recorded) if isinstance(recorded, str) else None
+        return found if found is not None and found.is_dir() else None
+    folder = Path(given)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of images")
+    places = [
+        (camera, frame)
+        for camera in range(len(model.rig.cameras))
+        for frame in range(model.scene.num_frames)
+        if model.has_image(camera, frame)
+    ]
+    first = model.image_name(*places[0])
+    if not (folder / first).is_file():
+        raise InputError(f"{folder} lacks {first}, an image of the model")
+    return folder
