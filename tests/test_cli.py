@@ -27,6 +27,7 @@ COMMANDS = [
     ["batch"],
     ["clean"],
     ["export"],
+    ["map"],
     ["simulate"],
     ["simulate", "images"],
     ["simulate", "observations"],

@@ -27,7 +27,7 @@ from uwsfm.cli_options import (
     wanted_of,
 )
 from uwsfm.cli_simulate import simulate_app
-from uwsfm.cli_surface import clean
+from uwsfm.cli_surface import clean, map_
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
 app.command()(clean)
+app.command("map")(map_)
 
 FAILED, WRONG_INPUT = 1, 2
 

@@ -1,7 +1,7 @@
 """Clouds, meshes, maps and colour."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -68,6 +68,53 @@ def clean(
     report = clean_cloud(source, out, **given)
     _print_filters(report)
     typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
+
+
+def map_(
+    source: SourceArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    up: Annotated[
+        Literal["plane", "x", "y", "z", "-x", "-y", "-z"] | None,
+        typer.Option(
+            help="The world's axis that points up, --up=z or --up=-z; plane: the plane "
+            "through the points is level (the default without positions).",
+            show_default=False,
+        ),
+    ] = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Side of a cell (default: the spacing of the points).",
+            show_default=False,
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Distance between points that is bridged (default: five spacings); "
+            "what is wider stays a hole.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write a height map and an orthophoto as GeoTIFF, with a picture of both."""
+    from rich.markup import escape
+
+    from uwsfm.console import console
+    from uwsfm.surface.commands import make_map
+
+    report = make_map(source, out, up=up, resolution=resolution, max_gap=max_gap)
+    short = "m" if report["unit"] == "metre" else "of an arbitrary unit"
+    typer.echo(
+        f"{report['num_columns']} x {report['num_rows']} cells of "
+        f"{report['resolution_m']:g} {short}, {report['share_with_data']:.0%} with "
+        f"data; {report['level']}"
+    )
+    for warning in report["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    typer.echo(f"wrote {out}: height.tif, ortho.tif, map.json, map.png")
 
 
 def _print_filters(report: dict[str, Any]) -> None:

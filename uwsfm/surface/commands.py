@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from uwsfm._files import replaced_dir
 from uwsfm._ply import write_ply
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
 from uwsfm.export.files import checked_target
 from uwsfm.export.summary import write_json
+from uwsfm.geometry import rigid3
 from uwsfm.surface.clean import clean_points, default_options
+from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
+from uwsfm.surface.height_map import make_height_map
 from uwsfm.surface.las import write_las
+from uwsfm.surface.level import world_from_map
+from uwsfm.surface.packages import import_package
+from uwsfm.surface.preview import write_preview
 from uwsfm.surface.source import find_source
 
 
@@ -90,3 +97,65 @@ def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
     cloud = found.cloud()
     write_las(cloud, target, found.unit)
     return cloud
+
+
+def make_map(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    up: str | None = None,
+    resolution: float | None = None,
+    max_gap: float | None = None,
+) -> dict[str, Any]:
+    """Write a height map and an orthophoto: height.tif, ortho.tif, map.json, map.png.
+
+    Args:
+        source: result folder, or a PLY of its (of a mesh, its vertices count).
+        folder: to write; must not exist.
+        up: what is up in the world, one of `uwsfm.surface.level.UPS`; default: the
+            plane through the points is level, unless the world is that of positions.
+        resolution: side of a cell, metres; default: the spacing of the points.
+        max_gap: longest distance between points to bridge; default: five spacings.
+
+    Returns:
+        What map.json holds.
+
+    Raises:
+        InputError: nothing to read, something to write over, or up is not known.
+        MissingPackageError: tifffile or matplotlib is missing.
+    """
+    target = checked_target(folder)
+    for package in ("tifffile", "matplotlib"):
+        import_package(package, "uwsfm map")
+    found = find_source(source)
+    cloud = found.cloud()
+    level = found.level(cloud, up)
+    points = rigid3.transform(level.map_from_world, cloud.points)
+    grid = make_height_map(points, cloud.colors, resolution, max_gap)
+    pose = world_from_map(level)
+    report = {
+        "source": str(found.path),
+        "unit": found.unit,
+        "level": level.method,
+        "plane_stddev_m": level.plane_stddev,
+        "resolution_m": grid.resolution,
+        "max_gap_m": grid.max_gap,
+        "west_m": grid.west,
+        "north_m": grid.north,
+        "num_rows": grid.height.shape[0],
+        "num_columns": grid.height.shape[1],
+        "share_with_data": float(np.mean(np.isfinite(grid.height))),
+        "world_from_map": {
+            "rotation_xyzw": pose[:4].tolist(),
+            "translation_m": pose[4:].tolist(),
+        },
+        "warnings": found.warnings(),
+    }
+    frame = f"uwsfm local frame, {level.method}"
+    title = f"{level.method}; cells {grid.resolution:g}, gaps up to {grid.max_gap:.2g}"
+    with replaced_dir(target) as partial:
+        write_height_tiff(grid, partial / "height.tif", frame, found.unit)
+        write_color_tiff(grid, partial / "ortho.tif", frame, found.unit)
+        write_preview(grid, partial / "map.png", title, found.unit)
+        write_json(report, partial / "map.json")
+    return report

@@ -1,15 +1,19 @@
 """The cloud that is meant by a result folder or by a file."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwsfm._ply import read_vertices
 from uwsfm.cloud import Cloud, read_cloud, unit_of_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import POINTS, SPARSE, read_model, unit_of_model
+from uwsfm.export.files import POINTS, SPARSE, SUMMARY, read_model, unit_of_model
+from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.surface.level import Level, find_level
 
 DENSE_CLOUD = "dense/cloud.ply"
 
@@ -75,13 +79,51 @@ class Source:
         total = np.bincount(scene.point_idx, ranges, minlength=count)
         return total / np.bincount(scene.point_idx, minlength=count)
 
-    def camera_centers(self) -> Array | None:
-        """Of the frames (F, 3) in the world; None without a reconstruction."""
-        if self.folder is None:
-            return None
-        from uwsfm.geometry import rigid3
+    def level(self, cloud: Cloud, up: str | None) -> Level:
+        """The level frame of its world, see `uwsfm.surface.level.find_level`.
 
-        return rigid3.inverse(read_model(self.folder).scene.rig_from_world)[:, 4:]
+        Above the points are the cameras, or else where most normals point to.
+
+        Raises:
+            InputError: which way is up would be a guess.
+        """
+        above, has_positions = None, False
+        if self.folder is not None:
+            poses = read_model(self.folder).scene.rig_from_world
+            above = rigid3.inverse(poses)[:, 4:].mean(axis=0)
+            has_positions = read_summary(self.folder).get("positions") is not None
+        elif np.isfinite(cloud.normals).all(axis=1).any():
+            reach = np.nanmax(np.abs(cloud.points))
+            mean = np.nanmean(cloud.normals, axis=0)
+            above = np.nanmedian(cloud.points, axis=0) + 1e3 * reach * mean
+        return find_level(up, cloud.points, above, has_positions=has_positions)
+
+    def warnings(self) -> list[str]:
+        """What the user should know, one sentence each."""
+        found = []
+        if self.is_sparse:
+            found.append(
+                f"{self.path} holds the points of the adjustment, far fewer than a "
+                f"dense cloud, and there is no {DENSE_CLOUD} (uwsfm dense)"
+            )
+        if self.unit != "metre":
+            found.append("the scale of this reconstruction is arbitrary: no metres")
+        return found
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """summary.json of a result folder; empty if there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path = folder / SUMMARY
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError):
+        raise InputError(f"{path} is damaged") from None
 
 
 def find_source(path: str | Path) -> Source:
