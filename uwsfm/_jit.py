@@ -1,4 +1,4 @@
-"""The one decorator for compiled kernels, and where their machine code is kept.
+"""The decorators of compiled kernels, and where their machine code is kept.
 
 Numba keys its cache by the file of the outermost function only, so an edit in a
 kernel's callee would go unnoticed. Keying the cache folder by the source of everything
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import config
+from numba.core.registry import CPUDispatcher
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -66,9 +67,26 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
 }
+# What is called by kernels alone needs no entrance from Python, which is a fifth of
+# what there is to compile.
+_INNER = {**_OPTIONS, "no_cpython_wrapper": True}
 
 # What SIMD needs and no more: sums may be regrouped, NaN stays NaN.
 _LANE_MATH = {"nsz", "arcp", "contract", "reassoc"}
+
+
+class _InnerDispatcher(CPUDispatcher):
+    """A kernel without an entrance from Python: to call that would end the process.
+
+    Called from Python all the same, in tests say, it is compiled with one, for this
+    process alone: in the cache both would have the same name.
+    """
+
+    def __call__(self, *args: Any) -> Any:
+        if not hasattr(self, "_entrance"):
+            options = {**self.targetoptions, "no_cpython_wrapper": False}
+            self._entrance = numba.jit(**options)(self.py_func)
+        return self._entrance(*args)
 
 
 def kernel(function: Function) -> Function:
@@ -77,17 +95,33 @@ def kernel(function: Function) -> Function:
     return compiled(function)
 
 
+def inner(function: Function) -> Function:
+    """Compile a kernel that only kernels call."""
+    return _inner(function, **_INNER)
+
+
 def fused(function: Function) -> Function:
     """Compile a kernel whose sums may be regrouped, as those of lanes are."""
     compiled: Any = numba.njit(**_OPTIONS, fastmath=_LANE_MATH)
     return compiled(function)
 
 
+def inner_fused(function: Function) -> Function:
+    """Compile a kernel that only kernels call, and whose sums may be regrouped."""
+    return _inner(function, **_INNER, fastmath=_LANE_MATH)
+
+
 def lane(function: Function) -> Function:
-    """Compile a formula of one lane, or a loop over lanes, for SIMD.
+    """Compile a formula of one lane, or a loop over lanes, for SIMD; inner.
 
     It becomes part of its caller, else the caller's loop would not vectorise: keep it
     free of branches (min, max, `x if ok else y`), inner loops and arrays of any length.
     """
-    compiled: Any = numba.njit(**_OPTIONS, fastmath=_LANE_MATH, forceinline=True)
-    return compiled(function)
+    return _inner(function, **_INNER, fastmath=_LANE_MATH, forceinline=True)
+
+
+def _inner(function: Function, **options: Any) -> Function:
+    compiled: Any = numba.njit(**options)(function)
+    if isinstance(compiled, CPUDispatcher):  # not where compilation is turned off
+        compiled.__class__ = _InnerDispatcher
+    return compiled

@@ -17,7 +17,7 @@ sqrt(1 - k_i^2 p^2) + i k_i p, with p divided out. Scalar kernels; failure is Na
 
 import math
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 
 MAX_STEPS = 60
 # Below this share of R^2 the squared p takes the series: the quotient loses digits.
@@ -90,7 +90,7 @@ def dome_port_newton(kappa, a, b, c, q, rho, radius, outer, mu_glass, mu_water):
     return imag, imag / slope, m2
 
 
-@kernel
+@inner
 def solve_dome_port(a, b, c, q, radius, thick, mu_glass, mu_water):
     """Solve the dome-port equation for kappa.
 

@@ -11,7 +11,7 @@ central counterpart are not looked for: RANSAC draws another sample.
 import cmath
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.geometry.vec3 import dot
 
 NEWTON_STEPS = 8
@@ -21,7 +21,7 @@ RANGE_TOLERANCE = 1e-12
 MAX_SHIFT = 0.1
 
 
-@kernel
+@inner
 def _quartic_roots(a4, a3, a2, a1, a0):
     """The four complex roots, by Ferrari's method; accurate to about 1e-6."""
     b3, b2, b1, b0 = a3 / a4, a2 / a4, a1 / a4, a0 / a4
@@ -54,7 +54,7 @@ def _quartic_roots(a4, a3, a2, a1, a0):
     )
 
 
-@kernel
+@inner
 def _central_ranges(cos_bc, cos_ac, cos_ab, d_bc, d_ac, d_ab, ranges):
     """Grunert: ranges (4, 3) of points on rays from one origin, written.
 
@@ -100,7 +100,7 @@ def _central_ranges(cos_bc, cos_ac, cos_ab, d_bc, d_ac, d_ab, ranges):
     return found
 
 
-@kernel
+@inner
 def _newton_step(ray_a, ray_b, ray_c, ranges, squares, centre, share):
     """One Newton step on the three distances, with origins moved by a share.
 
@@ -145,7 +145,7 @@ def _newton_step(ray_a, ray_b, ray_c, ranges, squares, centre, share):
     return max(abs(e1) / squares[0], abs(e2) / squares[1], abs(e3) / squares[2])
 
 
-@kernel
+@inner
 def _follow(ray_a, ray_b, ray_c, ranges, squares, centre, shift):
     """Move the origins from the centre to their places; whether ranges came along."""
     stages = 1 + int(min(shift / MAX_SHIFT, 20.0))
@@ -160,7 +160,7 @@ def _follow(ray_a, ray_b, ray_c, ranges, squares, centre, shift):
     return ahead and error < 1e3 * RANGE_TOLERANCE
 
 
-@kernel
+@inner
 def _frame(p, q, r):
     """Orthonormal axes of a triangle, 9 scalars: along pq, across, normal."""
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -183,7 +183,7 @@ def _frame(p, q, r):
     )
 
 
-@kernel
+@inner
 def _on_ray(ray, length):
     return (
         ray[0] + length * ray[3],
@@ -192,7 +192,7 @@ def _on_ray(ray, length):
     )
 
 
-@kernel
+@inner
 def _origins(ray_a, ray_b, ray_c):
     """The mean of three origins, and how far apart they are."""
     x = (ray_a[0] + ray_b[0] + ray_c[0]) / 3.0
@@ -203,7 +203,7 @@ def _origins(ray_a, ray_b, ray_c):
     return (x, y, z), spread
 
 
-@kernel
+@inner
 def _write_pose(in_rig, rig_anchor, in_world, world_anchor, pose):
     """The row of [R | t] that takes axes and a point of the world to the rig's."""
     for m in range(3):
@@ -218,7 +218,7 @@ def _write_pose(in_rig, rig_anchor, in_world, world_anchor, pose):
         pose[4 * m + 3] = rig_anchor[m] - turned
 
 
-@kernel
+@inner
 def poses_from_three(rays, points, i, j, k, ranges, poses):
     """Poses from three points and the rays that they lie on.
 

@@ -7,7 +7,7 @@ all rays through a flat port meet the axis along its normal.
 
 import math
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 
 MAX_STEPS = 60
 
@@ -67,7 +67,7 @@ def flat_port_step(q, low, height, r2, dist, thick, glass2, water2):
     return max(q - 2.0 * f * f1 / (2.0 * f1 * f1 - curvature), low), f
 
 
-@kernel
+@inner
 def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
     """Solve the flat-port equation for q = tan(theta in air) / |r|.
 
@@ -103,7 +103,7 @@ def solve_flat_port(height, r2, dist, thick, n_glass, n_water):
     return math.nan
 
 
-@kernel
+@inner
 def _solve_bracketed(height, r2, dist, thick, n_glass, n_water):
     """The same root for any order of the indices, by Newton between brackets."""
     index = min(n_glass, n_water)

@@ -1,27 +1,27 @@
 """3-vectors as tuples, for kernels."""
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 
 
-@kernel
+@inner
 def dot(p, q):
     """<p, q>"""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@kernel
+@inner
 def add(p, step, q):
     """p + step q"""
     return p[0] + step * q[0], p[1] + step * q[1], p[2] + step * q[2]
 
 
-@kernel
+@inner
 def scaled(factor, p):
     """factor p"""
     return factor * p[0], factor * p[1], factor * p[2]
 
 
-@kernel
+@inner
 def cross(p, q):
     """p x q"""
     return (

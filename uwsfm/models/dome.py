@@ -7,7 +7,7 @@ ends, its mount is in the image.
 
 import math
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.geometry.dome import dome_port_gradient, solve_dome_port
 from uwsfm.geometry.refraction import refract
 from uwsfm.models.status import (
@@ -48,7 +48,7 @@ def bent_by_dome(dx, dy, dz, cx, cy, cz, radius, outer, mu_g, mu_w):
     return px + cx, py + cy, pz + cz, wx, wy, wz
 
 
-@kernel
+@inner
 def dome_water_ray(dx, dy, dz, port):
     """Refract a finite unit direction in air through the dome.
 
@@ -80,7 +80,7 @@ def invariants(x, y, z, cx, cy, cz):
     )
 
 
-@kernel
+@inner
 def dome_air_ray(x, y, z, port):
     """Ray in air v = X - kappa c, not unit, of a point: (status, kappa, v (3))."""
     nan = math.nan
@@ -122,7 +122,7 @@ def dome_jac_row(lx, ly, lz, x, y, z, kappa, center, gradient):
     )
 
 
-@kernel
+@inner
 def dome_jac(x, y, z, kappa, port, lens_rows, jac):
     """Jacobian of the pixel of a point, by the implicit function theorem.
 

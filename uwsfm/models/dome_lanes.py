@@ -2,7 +2,7 @@
 
 import math
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.geometry.dome import dome_port_gradient, dome_port_newton, dome_port_start
 from uwsfm.models.dome import bent_by_dome, dome_jac_row, invariants
 from uwsfm.models.lanes import (
@@ -27,7 +27,7 @@ from uwsfm.models.lanes import (
 LAST_STEP2 = 1e-18
 
 
-@kernel
+@inner
 def dome_air_lanes(port, buffer):
     """Rays in air of the points: ROOT, VX, VY, VZ and OK from X, Y, Z."""
     cx, cy, cz, radius = port[0], port[1], port[2], port[3]
@@ -68,7 +68,7 @@ def _write(buffer, row, i, values, by_glass, by_water):
     buffer[(row + 9) * STRIDE + i] = values[9]
 
 
-@kernel
+@inner
 def dome_jac_lanes(port, buffer):
     """Jacobians of the pixels by point and port from ROOT and d(pixel) / dv."""
     cx, cy, cz, radius, thick = port[0], port[1], port[2], port[3], port[4]
@@ -89,7 +89,7 @@ def dome_jac_lanes(port, buffer):
         _write(buffer, JAC_V, i, row_v, by_glass, by_water)
 
 
-@kernel
+@inner
 def dome_ray_lanes(port, buffer):
     """Water rays of the directions in air VX, VY, VZ, see `lanes.store_ray`."""
     cx, cy, cz, radius = port[0], port[1], port[2], port[3]

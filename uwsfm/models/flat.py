@@ -6,7 +6,7 @@ in metres. Failure is a status and NaN.
 
 import math
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.geometry.refraction import refract, slope, solve_flat_port
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.models.status import (
@@ -37,7 +37,7 @@ def bent_by_flat(dx, dy, dz, nx, ny, nz, dist, thick, mu_g, mu_w):
     return a * dx + b * gx, a * dy + b * gy, a * dz + b * gz, wx, wy, wz
 
 
-@kernel
+@inner
 def flat_water_ray(dx, dy, dz, port):
     """Refract a finite unit direction in air through the port (paper eq. 1-4).
 
@@ -62,7 +62,7 @@ def flat_water_ray(dx, dy, dz, port):
     return VALID, ox, oy, oz, wx, wy, wz
 
 
-@kernel
+@inner
 def flat_air_ray(x, y, z, port):
     """Ray in air v = n + q r of a finite point: (status, q, v (3)), v not unit."""
     nan = math.nan
@@ -135,7 +135,7 @@ def flat_jac_row(lx, ly, lz, rx, ry, rz, q, normal, basis, gradient):
     )
 
 
-@kernel
+@inner
 def flat_jac(x, y, z, q, port, lens_rows, jac):
     """Jacobian of the pixel of a point, by the implicit function theorem.
 

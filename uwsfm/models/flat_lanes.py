@@ -1,6 +1,6 @@
 """The flat port over lanes: see `uwsfm.models.flat` for the equations."""
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.geometry.refraction import flat_port_start, flat_port_step
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.models.flat import bent_by_flat, flat_gradient, flat_jac_row
@@ -26,7 +26,7 @@ from uwsfm.models.lanes import (
 LAST_STEP_FROM = 1e-6
 
 
-@kernel
+@inner
 def flat_air_lanes(port, buffer):
     """Rays in air of the points: ROOT, VX, VY, VZ and OK from X, Y, Z."""
     nx, ny, nz, dist, thick = port[0], port[1], port[2], port[3], port[4]
@@ -59,7 +59,7 @@ def _write(buffer, row, i, values):
         buffer[(row + k) * STRIDE + i] = values[k]
 
 
-@kernel
+@inner
 def flat_jac_lanes(port, buffer):
     """Jacobians of the pixels by point and port from ROOT and d(pixel) / dv."""
     nx, ny, nz, dist, thick, n_air = (
@@ -91,7 +91,7 @@ def flat_jac_lanes(port, buffer):
         buffer[(JAC_V + 9) * STRIDE + i] = 0.0
 
 
-@kernel
+@inner
 def flat_ray_lanes(port, buffer):
     """Water rays of the directions in air VX, VY, VZ, see `lanes.store_ray`."""
     nx, ny, nz, dist, thick = port[0], port[1], port[2], port[3], port[4]

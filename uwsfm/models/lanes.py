@@ -9,7 +9,7 @@ scalar kernels of `uwsfm.models.projection`, which also know the reason of a fai
 import math
 from typing import Final
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 
 BLOCK: Final = 64
 """Lanes: eight AVX-512 registers; the rows of a Jacobian still fit the L1 cache."""
@@ -33,7 +33,7 @@ NUM_ROWS: Final = JAC_V + NUM_COLUMNS
 SIZE: Final = NUM_ROWS * STRIDE
 
 
-@kernel
+@inner
 def load_rows(values, first, count, row, num_columns, buffer):
     """Copy values[first : first + count] into ``num_columns`` rows from ``row``.
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
@@ -110,7 +110,7 @@ def _fisheye_limit(row: Array) -> float:
     return min(math.sqrt(square), 0.5 * math.pi)
 
 
-@kernel
+@inner
 def distort(u, v, lens):
     """Distorted (u, v), and d(distorted) / d(u, v) as 4 scalars; NaN out of range."""
     if lens[12] == 0.0:
@@ -157,7 +157,7 @@ def brown(u, v, params):
     return x, y, xu, xv, yv, xu * yv - xv * xv
 
 
-@kernel
+@inner
 def _distort_brown(u, v, lens):
     x, y, xu, xv, yv, det = brown(u, v, coefficients(lens))
     # Tangential terms fold it a little earlier than the limit of the radial ones.
@@ -176,7 +176,7 @@ def fisheye_angle(theta, params):
     return value, slope
 
 
-@kernel
+@inner
 def _distort_fisheye(u, v, lens):
     s = u * u + v * v
     radius = math.sqrt(s)
@@ -200,7 +200,7 @@ def _distort_fisheye(u, v, lens):
     )
 
 
-@kernel
+@inner
 def jac_by_params(u, v, lens, jac):
     """d(pixel) / d(fx, fy, cx, cy, k1, k2, p1, p2, k3 .. k6), (2, 12), written.
 
@@ -234,7 +234,7 @@ def jac_by_params(u, v, lens, jac):
     jac[0, 7], jac[1, 7] = fx * (s + 2.0 * u * u), fy * 2.0 * u * v
 
 
-@kernel
+@inner
 def img_from_dir(x, y, z, lens):
     """Pixel of a direction in the camera frame, and d(pixel) / d(x, y, z).
 
@@ -261,7 +261,7 @@ def img_from_dir(x, y, z, lens):
     )
 
 
-@kernel
+@inner
 def dir_from_img(px, py, lens):
     """Unit direction in the camera frame of a pixel; NaN where none exists."""
     nan = math.nan
@@ -278,7 +278,7 @@ def dir_from_img(px, py, lens):
     return u / norm, v / norm, 1.0 / norm
 
 
-@kernel
+@inner
 def _undistort_brown(xd, yd, lens):
     """Newton on the distortion, halved where it would leave the invertible disc."""
     u, v = xd, yd
@@ -303,7 +303,7 @@ def _undistort_brown(xd, yd, lens):
     return math.nan, math.nan
 
 
-@kernel
+@inner
 def _dir_from_fisheye(xd, yd, lens):
     nan = math.nan
     target = math.sqrt(xd * xd + yd * yd)

@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.models.lanes import (
     BLOCK,
     LENS_U,
@@ -69,7 +69,7 @@ def _store(lens_fx, lens_fy, lens_cx, lens_cy, i, u, v, inv_z, distorted, ok, bu
     buffer[OK * STRIDE + i] *= 1.0 if ok > 0.0 else 0.0
 
 
-@kernel
+@inner
 def img_lanes(lens, buffer):
     """Pixels and d(pixel) / dv of the rays in air VX, VY, VZ."""
     fx, fy, cx, cy, limit = lens[0], lens[1], lens[2], lens[3], lens[13]
@@ -129,7 +129,7 @@ def _fisheye_step(theta, target, params):
     return theta - step, step * step
 
 
-@kernel
+@inner
 def dir_lanes(lens, buffer):
     """Unit directions in air VX, VY, VZ and OK of the pixels PX, PY."""
     inv_fx, inv_fy, cx, cy = 1.0 / lens[0], 1.0 / lens[1], lens[2], lens[3]

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.models.dome import dome_air_ray, dome_jac, dome_water_ray
 from uwsfm.models.dome_lanes import dome_air_lanes, dome_jac_lanes, dome_ray_lanes
 from uwsfm.models.flat import flat_air_ray, flat_jac, flat_water_ray
@@ -43,7 +43,7 @@ JAC_SIZE = 10
 or centre (3) of a dome; thickness, n_glass, n_water; radius of a dome."""
 
 
-@kernel
+@inner
 def water_ray_from_dir(dx, dy, dz, port):
     """Refract a unit direction in air through a port.
 
@@ -58,7 +58,7 @@ def water_ray_from_dir(dx, dy, dz, port):
     return flat_water_ray(dx, dy, dz, port)
 
 
-@kernel
+@inner
 def unproject(px, py, lens, port):
     """Water ray of a pixel: (status, origin (3), unit direction (3))."""
     nan = math.nan
@@ -68,7 +68,7 @@ def unproject(px, py, lens, port):
     return water_ray_from_dir(dx, dy, dz, port)
 
 
-@kernel
+@inner
 def air_ray(x, y, z, port):
     """Ray in air of a point: (status, root of the port's equation, v (3), not unit)."""
     if not abs(x) + abs(y) + abs(z) < math.inf:
@@ -79,7 +79,7 @@ def air_ray(x, y, z, port):
     return flat_air_ray(x, y, z, port)
 
 
-@kernel
+@inner
 def project(x, y, z, lens, port):
     """Pixel of a point: (status, px, py)."""
     status, _, vx, vy, vz = air_ray(x, y, z, port)
@@ -93,7 +93,7 @@ def project(x, y, z, lens, port):
     return VALID, px, py
 
 
-@kernel
+@inner
 def project_with_jac(x, y, z, lens, port, jac):
     """Pixel of a point and its closed-form Jacobian.
 
@@ -121,14 +121,14 @@ def project_with_jac(x, y, z, lens, port, jac):
     return VALID, px, py
 
 
-@kernel
+@inner
 def lens_jac_of_point(x, y, z, lens, port, jac):
     """d(pixel) / d(lens parameters) of a point that projects: jac (2, 12), written."""
     _, _, vx, vy, vz = air_ray(x, y, z, port)
     jac_by_params(vx / vz, vy / vz, lens, jac)
 
 
-@kernel
+@inner
 def air_lanes(port, buffer):
     """Rays in air of the points of a buffer, see `uwsfm.models.lanes`."""
     if port[KIND] == DOME:
@@ -137,14 +137,14 @@ def air_lanes(port, buffer):
         flat_air_lanes(port, buffer)
 
 
-@kernel
+@inner
 def project_lanes(lens, port, buffer):
     """PX, PY and d(pixel) / dv of points X, Y, Z; lanes that are not OK are undone."""
     air_lanes(port, buffer)
     img_lanes(lens, buffer)
 
 
-@kernel
+@inner
 def jac_lanes(port, buffer):
     """JAC_SIZE columns of the Jacobian, after `project_lanes`."""
     if port[KIND] == DOME:
@@ -153,7 +153,7 @@ def jac_lanes(port, buffer):
         flat_jac_lanes(port, buffer)
 
 
-@kernel
+@inner
 def _unproject_rays(port, buffer):
     if port[KIND] == DOME:
         dome_ray_lanes(port, buffer)
@@ -161,7 +161,7 @@ def _unproject_rays(port, buffer):
         flat_ray_lanes(port, buffer)
 
 
-@kernel
+@inner
 def _take_rays(first, count, buffer, rays, status):
     for i in range(count):
         for k in range(3):

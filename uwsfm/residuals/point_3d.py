@@ -10,7 +10,7 @@ unit direction r in the rig's frame, P = I - r r^T, and the point X,
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot, scaled
 from uwsfm.models.status import BEHIND_CAMERA, NO_INTERSECTION, NOT_FINITE, VALID
@@ -21,7 +21,7 @@ MIN_DET = 1e-14
 """Of A: rays within 1e-7 radians of each other count as parallel."""
 
 
-@kernel
+@inner
 def _turned_into_rig(cam, p):
     """R^T p, with R the rotation of a row of [R | t]."""
     return (
@@ -31,7 +31,7 @@ def _turned_into_rig(cam, p):
     )
 
 
-@kernel
+@inner
 def _ray_in_rig(v, cam, port):
     """(status, origin (3), unit direction (3)) of a water ray in the rig's frame."""
     none = (math.nan, math.nan, math.nan)
@@ -46,7 +46,7 @@ def _ray_in_rig(v, cam, port):
     return VALID, _turned_into_rig(cam, origin), _turned_into_rig(cam, unit)
 
 
-@kernel
+@inner
 def _inverse_symmetric(xx, xy, xz, yy, yz, zz):
     """(regular, upper triangle (6) of the inverse) of a symmetric matrix (3x3)."""
     nan = math.nan
@@ -59,7 +59,7 @@ def _inverse_symmetric(xx, xy, xz, yy, yz, zz):
     return True, (inv * ixx, inv * ixy, inv * ixz, inv * iyy, inv * iyz, inv * izz)
 
 
-@kernel
+@inner
 def _times_symmetric(matrix, p):
     xx, xy, xz, yy, yz, zz = matrix
     return (
@@ -69,7 +69,7 @@ def _times_symmetric(matrix, p):
     )
 
 
-@kernel
+@inner
 def _triangulate(x, y, z, dirs, camera, first, last, cams, ports):
     """(status, e (3), A^-1 (6, upper triangle)): see `residual`."""
     nan = math.nan
@@ -100,7 +100,7 @@ def _triangulate(x, y, z, dirs, camera, first, last, cams, ports):
     return VALID, e, inverse
 
 
-@kernel
+@inner
 def residual(x, y, z, dirs, camera, first, last, cams, ports):
     """The triangulated point, minus the point; one cell.
 
@@ -121,7 +121,7 @@ def residual(x, y, z, dirs, camera, first, last, cams, ports):
     return status, e[0], e[1], e[2]
 
 
-@kernel
+@inner
 def residual_with_jac(x, y, z, dirs, camera, first, last, cams, arms, ports, j_border):
     """`residual`, with its Jacobians by the cameras; by the point it is -I.
 
@@ -151,7 +151,7 @@ def residual_with_jac(x, y, z, dirs, camera, first, last, cams, arms, ports, j_b
     return status, e[0], e[1], e[2]
 
 
-@kernel
+@inner
 def _by_camera(met, v, cam, arm, port, jac):
     """Write A de, as one camera causes it and in its frame, to columns 0-11 of jac.
 
@@ -195,7 +195,7 @@ def _by_camera(met, v, cam, arm, port, jac):
     _write(jac, 11, scaled(lift, w), none, m, rho, inv)
 
 
-@kernel
+@inner
 def _turn_and_shift(foot, m, rho, inv, cam, arm, jac):
     """Write columns 0-5 of `_by_camera`; ``foot`` is the ray's point nearest to X."""
     fx, fy, fz = foot[0] - cam[3], foot[1] - cam[7], foot[2] - cam[11]
@@ -209,7 +209,7 @@ def _turn_and_shift(foot, m, rho, inv, cam, arm, jac):
         _write(jac, 3 + k, shift, none, m, rho, inv)
 
 
-@kernel
+@inner
 def _write(jac, column, dfoot, drho, m, rho, inv):
     """Write P dfoot + rho <m, drho> / |rho|^2, with ``inv`` = 1 / |rho|^2."""
     slide = (dot(m, drho) - dot(rho, dfoot)) * inv

@@ -2,13 +2,13 @@
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.models.projection import lens_jac_of_point, project, project_with_jac
 from uwsfm.models.status import VALID
 from uwsfm.residuals.border import FIRST_LENS, RADIUS
 
 
-@kernel
+@inner
 def point_in_rig(frame, point):
     """Point (3) of a world point in the rig; ``frame`` is a row of [R | t]."""
     x, y, z = point[0], point[1], point[2]
@@ -19,7 +19,7 @@ def point_in_rig(frame, point):
     )
 
 
-@kernel
+@inner
 def residual(x, y, z, xy, cam, lens, port):
     """(status, rx, ry): projection of a point in the rig, minus the observation."""
     px, py, pz = point_in_rig(cam, (x, y, z))
@@ -27,7 +27,7 @@ def residual(x, y, z, xy, cam, lens, port):
     return status, u - xy[0], v - xy[1]
 
 
-@kernel
+@inner
 def residual_with_jac(
     x, y, z, xy, cam, arm, lens, port, free_lens, j_port, j_rig, j_border
 ):

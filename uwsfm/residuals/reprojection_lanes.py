@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from uwsfm._jit import kernel, lane
+from uwsfm._jit import inner, lane
 from uwsfm.models.lanes import (
     BLOCK,
     JAC_U,
@@ -40,7 +40,7 @@ COLUMN_OF_SLOT[:FIRST_LENS] = [13, 14, 15, 16, 17, 18, 3, 4, 5, 8, 6, 7, 9]
 COLUMN_OF_SLOT[FIRST_LENS:] = LENS + np.arange(BORDER_SIZE - FIRST_LENS)
 
 
-@kernel
+@inner
 def project_from_rig(cam, lens, port, buffer):
     """Project points X, Y, Z in the rig, which become those in the camera."""
     r11, r12, r13, tx = cam[0], cam[1], cam[2], cam[3]
@@ -54,7 +54,7 @@ def project_from_rig(cam, lens, port, buffer):
     project_lanes(lens, port, buffer)
 
 
-@kernel
+@inner
 def jac_from_rig(cam, arm, port, buffer):
     """All columns of the Jacobian, after `project_from_rig`."""
     jac_lanes(port, buffer)
@@ -90,7 +90,7 @@ def _rig_columns(cam, arm, row, buffer):
         buffer[arms + 2 * STRIDE + i] = lx * a31 + ly * a32 + lz * a33
 
 
-@kernel
+@inner
 def lens_columns(lens, j_lens, buffer):
     """Columns by the lens parameters: the rays in air are known.
 
@@ -106,7 +106,7 @@ def lens_columns(lens, j_lens, buffer):
             buffer[(JAC_V + LENS + k) * STRIDE + i] = j_lens[1, k]
 
 
-@kernel
+@inner
 def redo_lane(i, x, y, z, xy, cam, arm, lens, port, free_lens, scratch, buffer):
     """Residual and Jacobian of one lane by the scalar kernels, all but the point's.
 

@@ -16,7 +16,7 @@ e shrinks with f, so it is no measure for d: any error vanishes where f does.
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot
 from uwsfm.models.status import BEHIND_CAMERA, NOT_FINITE, VALID
@@ -24,7 +24,7 @@ from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.residuals.water_ray import slope_by_index, slope_by_u, water_ray
 
 
-@kernel
+@inner
 def _focus(index, s, a, tangential):
     """How fast a ray leaves the axis in a layer, by how fast it does so in air.
 
@@ -45,7 +45,7 @@ def _focus(index, s, a, tangential):
     )
 
 
-@kernel
+@inner
 def _miss(x, y, z, v, port, tangential):
     """(status, a, s_g, s_w, <n, X>, k + s_w h, f, w (3), g (3)) of a point X."""
     nan = math.nan
@@ -68,7 +68,7 @@ def _miss(x, y, z, v, port, tangential):
     return VALID, a, s_g, s_w, depth, reach, focal, w, g
 
 
-@kernel
+@inner
 def residual(x, y, z, v, cam, port, tangential):
     """The point, projected onto the outer surface, minus where the ray leaves it.
 
@@ -90,7 +90,7 @@ def residual(x, y, z, v, cam, port, tangential):
     return status, shrink * g[0], shrink * g[1], shrink * g[2]
 
 
-@kernel
+@inner
 def residual_with_jac(x, y, z, v, cam, arm, port, tangential, j_rig, j_border):
     """`residual`, with Jacobians by the point in the rig and by the camera.
 
@@ -117,7 +117,7 @@ def residual_with_jac(x, y, z, v, cam, arm, port, tangential, j_rig, j_border):
     return status, shrink * g[0], shrink * g[1], shrink * g[2]
 
 
-@kernel
+@inner
 def _by_point_and_port(point, v, port, tangential, miss, j_border):
     """Write d/dX (camera frame) to columns 0-2, d/d port to columns 6-11.
 
@@ -164,7 +164,7 @@ def _by_point_and_port(point, v, port, tangential, miss, j_border):
         j_border[i, 11] = (f_glass * g_i - by_glass * w_i) / n_air
 
 
-@kernel
+@inner
 def _focal_jac(focal, a, s_g, s_w, port, tangential):
     """Derivatives of f by d, t, n_g, n_w (relative to air) and u."""
     thick = port[4]
@@ -180,7 +180,7 @@ def _focal_jac(focal, a, s_g, s_w, port, tangential):
     )
 
 
-@kernel
+@inner
 def _chain_to_pose(turned, cam, arm, j_rig, j_border):
     """From d/dX in columns 0-2 of j_border to d/d(point in the rig), and columns 0-5.
 

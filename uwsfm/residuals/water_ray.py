@@ -11,12 +11,12 @@ All of it is smooth in the port, also where the distance passes through zero.
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.geometry.refraction import slope
 from uwsfm.models.status import MISSES_PORT, OUTSIDE_LENS, TOTAL_REFLECTION, VALID
 
 
-@kernel
+@inner
 def water_ray(v, port):
     """(status, a, s_g, s_w, w (3)) of a unit direction in air and a port row.
 
@@ -40,13 +40,13 @@ def water_ray(v, port):
     return VALID, a, slope(n_glass, u), slope(n_water, u), w
 
 
-@kernel
+@inner
 def slope_by_u(index, s):
     """ds/du of s = `slope` (index, u)."""
     return -0.5 * (index * index - 1.0) * s * s * s
 
 
-@kernel
+@inner
 def slope_by_index(index, s, a):
     """ds/dindex of s = `slope` (index, u), with 1 + u = 1/a^2."""
     return -index * s * s * s / (a * a)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.p3p import poses_from_three
 from uwsfm.models.status import VALID
 from uwsfm.residuals.reprojection import residual
@@ -22,7 +22,7 @@ LOCAL_ITERATIONS = 3
 MIN_GOOD = 0.5
 
 
-@kernel
+@inner
 def truncated_error(pose, matches, rig, limit, best):
     """(sum of min(error^2, limit), inliers); it stops when it exceeds ``best``."""
     points, camera_idx, xy = matches

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import fused, lane
+from uwsfm._jit import inner_fused, lane
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.chunks import COUPLING, GRAD, width
 from uwsfm.solver.layout import Layout
@@ -44,7 +44,7 @@ def _torque(x, y, z, a, b, c):
     return y * c - z * b, z * a - x * c, x * b - y * a
 
 
-@fused
+@inner_fused
 def _add_couplings(rows, j, num_free, x, y, z, frame, f, first_col, of_frame, of_point):
     """What observation j couples to its camera: its frame f and its point."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
@@ -63,7 +63,7 @@ def _add_couplings(rows, j, num_free, x, y, z, frame, f, first_col, of_frame, of
         of_point[col, 2] += r13 * c0 + r23 * c1 + r33 * c2
 
 
-@fused
+@inner_fused
 def rotation(frames, f):
     """Nine numbers of the rotation in a row of [R | t]."""
     return (
@@ -79,7 +79,7 @@ def rotation(frames, f):
     )
 
 
-@fused
+@inner_fused
 def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
     """Row a of M^T H: times M it belongs to the frame, times R to the coupling."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
@@ -97,7 +97,7 @@ def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
     return w0, w1, w2
 
 
-@fused
+@inner_fused
 def add_cell(
     x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, cells, grad, v
 ):
@@ -141,7 +141,7 @@ def add_cell(
         v[p, 2, k] += r13 * a[k] + r23 * b[k] + r33 * d[k]
 
 
-@fused
+@inner_fused
 def _sum_rows(rows, first, last):
     """J^T W J by the point in the rig (lower triangle), J^T W r: 9 scalars."""
     h00, h10, h11, h20, h21, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -159,7 +159,7 @@ def _sum_rows(rows, first, last):
     return h00, h10, h11, h20, h21, h22, g0, g1, g2
 
 
-@fused
+@inner_fused
 def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
     """Add the rows of an evaluated chunk to the blocks of its points and the sums."""
     rows, in_rig, w = chunk.rows, chunk.in_rig, sums.blocks.shape[1]

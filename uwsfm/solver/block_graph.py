@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD, Layout
 
@@ -77,7 +77,7 @@ def build_graph(layout: Layout) -> BlockGraph:
     )
 
 
-@kernel
+@inner
 def _mark_row(entries, i, seen):
     """Mark with i the frames j <= i that share a point with frame i; their number, and
     how many cells were met."""
@@ -119,7 +119,7 @@ def _list_blocks(entries, row_start, row_other):
                 row_other[at] = j
 
 
-@kernel
+@inner
 def find_block(row_start, row_other, i, j, start):
     """Where the block of row i and frame j <= i is, not before ``start``."""
     end = row_start[i + 1] - 1

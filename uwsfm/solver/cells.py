@@ -6,7 +6,7 @@ its coupling to the border (``couple``), and the border's own blocks.
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.models.status import VALID
 from uwsfm.residuals import point_3d, reprojection, virtual_camera
 from uwsfm.solver.error_models import (
@@ -16,7 +16,7 @@ from uwsfm.solver.error_models import (
 from uwsfm.solver.losses import INVALID_PX, rho
 
 
-@kernel
+@inner
 def cell_cost(layout, state, error, c, x, y, z, loss, scale):
     """(cost, number of valid errors) of a cell whose point is at (x, y, z) in the rig.
 
@@ -49,7 +49,7 @@ def cell_cost(layout, state, error, c, x, y, z, loss, scale):
     return cost, valid
 
 
-@kernel
+@inner
 def linearized_residual(layout, state, i, x, y, z, j_port, j_rig, j_border):
     """Reprojection error of sorted observation i, at a point (x, y, z) in the rig."""
     k = layout.camera[i]
@@ -69,7 +69,7 @@ def linearized_residual(layout, state, i, x, y, z, j_port, j_rig, j_border):
     )
 
 
-@kernel
+@inner
 def _add_rows(layout, camera, row, rx, ry, weight, work):
     """Add two weighted rows of one camera to its cell's sums and to its own block."""
     start = layout.free_start[camera]
@@ -96,7 +96,7 @@ def _add_rows(layout, camera, row, rx, ry, weight, work):
             )
 
 
-@kernel
+@inner
 def scatter_blocks(layout, work, out):
     """Add the cameras' own blocks to the border, where they may share columns."""
     for camera in range(len(work.blocks)):
@@ -111,7 +111,7 @@ def scatter_blocks(layout, work, out):
                     out.border[other, col] += work.blocks[camera, s, t]
 
 
-@kernel
+@inner
 def add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work):
     """Virtual-camera errors of a cell: three rows each, and one of zeros."""
     unit2 = error.unit * error.unit
@@ -137,7 +137,7 @@ def add_virtual_camera(layout, state, error, c, x, y, z, loss, scale, work):
         _add_rows(layout, k, 2, ez, 0.0, weight * unit2, work)
 
 
-@kernel
+@inner
 def add_point_3d(layout, state, error, c, x, y, z, loss, scale, work, out):
     """The 3-D point error of a cell: J by the point in the rig is -I."""
     first, last = layout.cell_start[c], layout.cell_start[c + 1]

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lanes import BLOCK, OK, PX, PY, SIZE, STRIDE, X, Y, Z
 from uwsfm.models.lens import NUM_PARAMS
@@ -109,7 +109,7 @@ def _columns(layout: Layout) -> IndexArray:
     return columns
 
 
-@kernel
+@inner
 def chunk_end(layout, p, end):
     """The point after the last one of the chunk that starts with point p."""
     first = layout.cell_start[layout.point_start[p]]
@@ -121,7 +121,7 @@ def chunk_end(layout, p, end):
     return p
 
 
-@kernel
+@inner
 def gather(layout, state, first_point, last_point, chunk):
     """Move the points to the rig and list the observations of each camera."""
     counts, bucket, in_rig = chunk.counts, chunk.bucket, chunk.in_rig
@@ -142,7 +142,7 @@ def gather(layout, state, first_point, last_point, chunk):
     return first
 
 
-@kernel
+@inner
 def _load(chunk, camera, start, count):
     """Points in the rig of a camera's observations into lanes."""
     bucket, in_rig, buffer = chunk.bucket, chunk.in_rig, chunk.buffer
@@ -153,7 +153,7 @@ def _load(chunk, camera, start, count):
         buffer[Z * STRIDE + i] = in_rig[j, 2]
 
 
-@kernel
+@inner
 def evaluate(layout, state, first, chunk):
     """Residuals of a gathered chunk into ``errors``."""
     errors, buffer, bucket = chunk.errors, chunk.buffer, chunk.bucket
@@ -176,7 +176,7 @@ def evaluate(layout, state, first, chunk):
                     errors[j, 0], errors[j, 1] = rx, ry
 
 
-@kernel
+@inner
 def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
     """Products of residuals and Jacobians of a gathered chunk into ``rows``.
 
@@ -204,7 +204,7 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
                     rows[j, a] = products[(CELL + a) * STRIDE + i]
 
 
-@kernel
+@inner
 def _residuals(layout, state, first, k, start, count, chunk):
     """RES_U and RES_V; lanes that are not OK once more, by the scalar kernels."""
     buffer, bucket, xy = chunk.buffer, chunk.bucket, layout.xy
@@ -231,7 +231,7 @@ def _residuals(layout, state, first, k, start, count, chunk):
         buffer[RES_U * STRIDE + i], buffer[RES_V * STRIDE + i] = rx, ry
 
 
-@kernel
+@inner
 def cost_of_errors(errors, loss, scale, squares):
     """(0.5 sum rho(|e|^2), number of valid errors) of an evaluated chunk.
 

@@ -12,7 +12,7 @@ with S the reduced system and J~ the Jacobian after elimination of the points.
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.projection import JAC_SIZE
 from uwsfm.models.status import VALID
@@ -26,7 +26,7 @@ from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.state import KernelState
 
 
-@kernel
+@inner
 def _reach_of_point(layout, eqs, p, rows, out):
     """What a pull (3,) on a point does to the border, (B, 3): S^-1 [W; E^T]."""
     offset = rows.shape[1] - len(eqs.border_grad)
@@ -44,7 +44,7 @@ def _reach_of_point(layout, eqs, p, rows, out):
                 out[b, i] += rows[b, offset + k] * eqs.points_border[p, i, k]
 
 
-@kernel
+@inner
 def _add_score(layout, rows, col, force, pull, grad, camera, of_point, score):
     """Add S^-1 J~^T r of one observation: its own part, minus what its point takes."""
     offset = rows.shape[1] - len(score)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver import schur
 from uwsfm.solver.block_graph import find_block
@@ -110,7 +110,7 @@ def reduced_covariance(
     )
 
 
-@kernel
+@inner
 def _add_products(left, middle, right, twice, out):
     """out (3, 3) += L^T M R, or L^T M R + (L^T M R)^T; L (a, 3), M (a, b), R (b, 3)."""
     for i in range(3):
@@ -124,7 +124,7 @@ def _add_products(left, middle, right, twice, out):
                 out[j, i] += total
 
 
-@kernel
+@inner
 def _multiply(left, right, out):
     """(n, 3) times (3, 3)."""
     for i in range(len(out)):

@@ -8,7 +8,7 @@ the camera's free parameters, three rows each.
 import math
 from typing import Final
 
-from uwsfm._jit import fused, lane
+from uwsfm._jit import inner_fused, lane
 from uwsfm.models.lanes import BLOCK, JAC_U, JAC_V, STRIDE
 from uwsfm.residuals.reprojection_lanes import RESIDUAL, RIG
 from uwsfm.solver.losses import CAUCHY
@@ -20,7 +20,7 @@ COUPLE: Final = 10
 RES_U, RES_V = JAC_U + RESIDUAL, JAC_V + RESIDUAL
 
 
-@fused
+@inner_fused
 def weigh(count, loss, scale, buffer, products):
     """Weights rho'(s) of the first lanes, 0 of the others and of NaN residuals."""
     inv_c2 = 1.0 / (scale * scale) if loss == CAUCHY else 0.0
@@ -35,7 +35,7 @@ def weigh(count, loss, scale, buffer, products):
         products[WEIGHT * STRIDE + i] = 0.0
 
 
-@fused
+@inner_fused
 def multiply_cells(buffer, products):
     """Rows of CELL."""
     u, v = (JAC_U + RIG) * STRIDE, (JAC_V + RIG) * STRIDE
@@ -95,7 +95,7 @@ def _couple(column, row, buffer, products):
         out[2 * STRIDE + i] = c2
 
 
-@fused
+@inner_fused
 def multiply_camera(columns, num_free, sums, buffer, products):
     """Rows of COUPLE, and the sums over lanes of a camera against itself.
 

@@ -2,7 +2,7 @@
 
 import math
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner
 
 L2, CAUCHY = 0, 1
 LOSS_CODES = {"l2": L2, "cauchy": CAUCHY}
@@ -13,7 +13,7 @@ has no Jacobian; a smaller price would let a step win by driving points out of t
 water."""
 
 
-@kernel
+@inner
 def rho(s, loss, scale):
     """(rho(s), rho'(s)): l2 is s, cauchy is c^2 log(1 + s / c^2)."""
     if loss == CAUCHY:

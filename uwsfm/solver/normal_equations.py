@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
@@ -87,7 +87,7 @@ def empty_normal_equations(layout: Layout) -> NormalEquations:
     )
 
 
-@kernel
+@inner
 def _add_couplings(x, y, z, frame, p, f, couple, out):
     """Couplings of a cell (3, B) to the border, from its frame and its point."""
     rows = out.frames_border[f]
@@ -121,7 +121,7 @@ class Work(NamedTuple):
     j_cell: Array
 
 
-@kernel
+@inner
 def _work(num_border, num_cameras, largest_cell):
     return Work(
         np.empty((3, 3)),

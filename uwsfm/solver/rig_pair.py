@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.vec3 import dot
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
@@ -31,7 +31,7 @@ MAX_LOG_STEP = 2.0
 MIN_SQUARED_SINE = 1e-14
 
 
-@kernel
+@inner
 def rows_in_rig(x, y, z, cam, lens, port, jac, rows):
     """Pixel of a point in the rig, with the Jacobian (2, 3) written to ``rows``.
 
@@ -56,7 +56,7 @@ def rows_in_rig(x, y, z, cam, lens, port, jac, rows):
     return status, u, v
 
 
-@kernel
+@inner
 def midpoint(pose, ray_a, ray_b):
     """Where two rays nearly meet, in both rigs; NaN unless in front of both.
 
@@ -95,7 +95,7 @@ def midpoint(pose, ray_a, ray_b):
     )
 
 
-@kernel
+@inner
 def gap_with_jac(i, pose, matches, rig, jac, rows, row):
     """(whether there is one, signed gap in pixels) of a match.
 
@@ -143,7 +143,7 @@ def gap_with_jac(i, pose, matches, rig, jac, rows, row):
     return True, (miss_a + miss_b) * inv
 
 
-@kernel
+@inner
 def _cross(p, q):
     return (
         p[1] * q[2] - p[2] * q[1],
@@ -221,7 +221,7 @@ def pair_equations(pose, matches, use, rig, robust, length_prior, hessian, grad)
     return 0.5 * total
 
 
-@kernel
+@inner
 def _add_length_prior(pose, length_prior, hessian, grad):
     """weight (log |t| - mean)^2, which a turn does not change: its share of the sum."""
     x, y, z = pose[3], pose[7], pose[11]
@@ -236,7 +236,7 @@ def _add_length_prior(pose, length_prior, hessian, grad):
     return weight * miss * miss
 
 
-@kernel
+@inner
 def _moved_pair(pose, step, out):
     """The pose after a step: as `rigid3.perturb` to first order, but along the sphere.
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
@@ -24,7 +24,7 @@ MIN_RELATIVE_DECREASE = 1e-7
 """Of some hundred observations: one hundredth of a standard deviation of the pose."""
 
 
-@kernel
+@inner
 def in_rig(pose, point):
     """A point (3,) moved by a row of [R | t]."""
     x, y, z = point[0], point[1], point[2]
@@ -54,7 +54,7 @@ def squared_errors(pose, matches, rig, squares):
         squares[i] = rx * rx + ry * ry if status == VALID else math.inf
 
 
-@kernel
+@inner
 def pose_cost(pose, matches, use, rig, loss, scale):
     """Half the robust error of the observations in use (N,)."""
     points, camera_idx, xy = matches
@@ -72,7 +72,7 @@ def pose_cost(pose, matches, use, rig, loss, scale):
     return 0.5 * total
 
 
-@kernel
+@inner
 def normal_equations(pose, matches, use, rig, loss, scale, hessian, grad):
     """J^T J (6, 6), J^T r (6,) and the cost; tangent as `rigid3.perturb`."""
     points, camera_idx, xy = matches
@@ -114,7 +114,7 @@ def normal_equations(pose, matches, use, rig, loss, scale, hessian, grad):
     return 0.5 * total
 
 
-@kernel
+@inner
 def solve_damped(hessian, grad, damping, factor, step):
     """step = -(H + damping diag H)^-1 g by Cholesky; whether H is positive definite.
 
@@ -152,7 +152,7 @@ def solve_damped(hessian, grad, damping, factor, step):
     return True
 
 
-@kernel
+@inner
 def copy_into(out, values):
     """out[:] = values, of which numba would compile the error message too."""
     flat_out, flat_values = out.ravel(), values.ravel()
@@ -160,7 +160,7 @@ def copy_into(out, values):
         flat_out[i] = flat_values[i]
 
 
-@kernel
+@inner
 def slope_along(grad, step):
     """<grad, step>"""
     total = 0.0
@@ -169,7 +169,7 @@ def slope_along(grad, step):
     return total
 
 
-@kernel
+@inner
 def moved_pose(pose, step, out):
     """The row of [R | t] after a left perturbation, see `rigid3.perturb`; written."""
     x, y, z = step[0], step[1], step[2]

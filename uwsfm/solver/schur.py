@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import fused, lane
+from uwsfm._jit import fused, inner_fused, lane
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.block_graph import BlockGraph, find_block
 from uwsfm.solver.layout import HELD, Layout
@@ -45,7 +45,7 @@ class ReducedSystem(NamedTuple):
     """(P, 3, 3): inverses of the damped point blocks."""
 
 
-@fused
+@inner_fused
 def invert_damped(block, damping, inverse):
     """Inverse of a symmetric 3x3 with Marquardt damping; False if it is singular."""
     a = block[0, 0] + damping * max(block[0, 0], MIN_DIAGONAL)
@@ -96,7 +96,7 @@ def invert_points(eqs, damping, first, last, inverses, border, right):
                 border[k, m] -= s0 * e[p, 0, m] + s1 * e[p, 1, m] + s2 * e[p, 2, m]
 
 
-@fused
+@inner_fused
 def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
     """W V^-1 (6, 3) of one cell, and its part of the right side of row i."""
     v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
@@ -140,7 +140,7 @@ def _subtract_line(values, i, k, columns, w0, w1, w2):
     values[i, k, 3], values[i, k, 4], values[i, k, 5] = b3, b4, b5
 
 
-@fused
+@inner_fused
 def _subtract_border(borders, p, i, folded, coupling):
     """Coupling (B, 6) of row i -= E^T (W V^-1)^T."""
     columns = _columns(folded)
@@ -149,7 +149,7 @@ def _subtract_border(borders, p, i, folded, coupling):
         _subtract_line(coupling, i, k, columns, w0, w1, w2)
 
 
-@fused
+@inner_fused
 def _subtract_products(
     row_start, row_other, cell_row, first, last, i, cells, folded, blocks
 ):
@@ -166,7 +166,7 @@ def _subtract_products(
             _subtract_line(blocks, s, b, columns, w0, w1, w2)
 
 
-@fused
+@inner_fused
 def _fill_rows(graph, eqs, damping, first, last, system):
     """Rows as they are before any elimination."""
     blocks, coupling, right = system.blocks, system.coupling, system.right_frames

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._jit import kernel
+from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.vec3 import add, cross, dot
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
@@ -51,7 +51,7 @@ class Views(NamedTuple):
     """(N, 3) unit."""
 
 
-@kernel
+@inner
 def squared_error(views, keypoint, x, y, z):
     """Squared reprojection error of a keypoint at a world point; inf if invalid."""
     i = views.image[keypoint]
@@ -68,7 +68,7 @@ def squared_error(views, keypoint, x, y, z):
     return u * u + v * v if status == VALID else math.inf
 
 
-@kernel
+@inner
 def _midpoint(views, a, b):
     """(cosine of the angle, x, y, z): where two rays nearly meet; NaN if behind."""
     da = (views.dirs[a, 0], views.dirs[a, 1], views.dirs[a, 2])
@@ -86,7 +86,7 @@ def _midpoint(views, a, b):
     return cosine, 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
 
 
-@kernel
+@inner
 def _image_rows(views, keypoint, x, y, z, jac):
     """(status, miss (2), rows (6)): error of a keypoint and its slope in the world."""
     i = views.image[keypoint]
@@ -104,7 +104,7 @@ def _image_rows(views, keypoint, x, y, z, jac):
     return status, u - views.xy[keypoint, 0], v - views.xy[keypoint, 1], rows
 
 
-@kernel
+@inner
 def _gap(views, a, b, x, y, z, jac):
     """Sampson's distance, px, of two keypoints from those that a point near (x, y, z)
     can have: see `epipolar.ray_gaps_px`."""
@@ -141,7 +141,7 @@ def match_gaps_batch(views, ends, gaps):
         gaps[k] = gap if gap >= 0.0 else math.inf
 
 
-@kernel
+@inner
 def _select(views, left, num_left, x, y, z, limit, chosen):
     """(cost, count): each image's nearest keypoint, ``chosen`` if within the limit.
 
@@ -165,7 +165,7 @@ def _select(views, left, num_left, x, y, z, limit, chosen):
     return cost, count
 
 
-@kernel
+@inner
 def _gauss_newton_step(views, chosen, count, x, y, z, jac):
     """Step (3) towards the least reprojection error; NaN if it is not determined."""
     h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -197,7 +197,7 @@ def _gauss_newton_step(views, chosen, count, x, y, z, jac):
     )
 
 
-@kernel
+@inner
 def _best_hypothesis(views, left, num_left, limit, max_cosine, seed, chosen):
     """(found, x, y, z): the point of two rays with the least truncated cost."""
     num_pairs = num_left * (num_left - 1) // 2
@@ -234,7 +234,7 @@ def _best_hypothesis(views, left, num_left, limit, max_cosine, seed, chosen):
     return found, x, y, z
 
 
-@kernel
+@inner
 def _refined(views, left, num_left, x, y, z, limit, chosen, jac):
     """(count, x, y, z): the point moved to its least cost, and how many see it."""
     cost, count = _select(views, left, num_left, x, y, z, limit, chosen)
@@ -255,7 +255,7 @@ def _refined(views, left, num_left, x, y, z, limit, chosen, jac):
     return count, x, y, z
 
 
-@kernel
+@inner
 def _least_cosine(views, chosen, count):
     """Of the angles between the rays of some keypoints."""
     least = 1.0
@@ -272,7 +272,7 @@ def _least_cosine(views, chosen, count):
     return least
 
 
-@kernel
+@inner
 def _remaining(track, point_of, left):
     """How many keypoints of a track have no point yet; writes them to ``left``."""
     count = 0
@@ -283,7 +283,7 @@ def _remaining(track, point_of, left):
     return count
 
 
-@kernel
+@inner
 def _take(views, track, point_of, chosen, count, point, x, y, z, limit):
     """Give the chosen keypoints their point, and take its doubles away (-2): what else
     an image has there is the same feature twice."""
