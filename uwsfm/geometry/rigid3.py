@@ -19,13 +19,19 @@ IDENTITY.setflags(write=False)
 
 def rotmat_from_quat(quat: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of unit quaternions xyzw (..., 4)."""
-    x, y, z, w = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    quat = np.asarray(quat, dtype=np.float64)
+    x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    rotmat = np.empty((*quat.shape[:-1], 3, 3))
+    rotmat[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    rotmat[..., 0, 1] = 2 * (x * y - z * w)
+    rotmat[..., 0, 2] = 2 * (x * z + y * w)
+    rotmat[..., 1, 0] = 2 * (x * y + z * w)
+    rotmat[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    rotmat[..., 1, 2] = 2 * (y * z - x * w)
+    rotmat[..., 2, 0] = 2 * (x * z - y * w)
+    rotmat[..., 2, 1] = 2 * (y * z + x * w)
+    rotmat[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return rotmat
 
 
 def quat_from_rotmat(rotmat: ArrayLike) -> Array:
@@ -60,10 +66,17 @@ def from_rotmat(rotmat: ArrayLike, translation: ArrayLike) -> Array:
 def multiply_quats(q: ArrayLike, p: ArrayLike) -> Array:
     """Hamilton product q p of quaternions xyzw (..., 4): R(q p) = R(q) R(p)."""
     q, p = np.asarray(q, dtype=np.float64), np.asarray(p, dtype=np.float64)
-    qv, qw, pv, pw = q[..., :3], q[..., 3:], p[..., :3], p[..., 3:]
-    vector = qw * pv + pw * qv + np.cross(qv, pv)
-    scalar = qw * pw - np.sum(qv * pv, axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
+    qx, qy, qz, qw = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    px, py, pz, pw = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    return np.stack(
+        [
+            qw * px + pw * qx + (qy * pz - qz * py),
+            qw * py + pw * qy + (qz * px - qx * pz),
+            qw * pz + pw * qz + (qx * py - qy * px),
+            qw * pw - (qx * px + qy * py + qz * pz),
+        ],
+        axis=-1,
+    )
 
 
 def rotate(b_from_a: ArrayLike, vector_in_a: ArrayLike) -> Array:
