@@ -18,6 +18,7 @@ from uwsfm.solver.error_models import error_model
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.losses import INVALID_PX, rho
 from uwsfm.solver.state import State
+from uwsfm.solver.workspace import Workspace
 
 # 3 + 2 + 1 of the second camera, 3 of both ports, the index; then 8 of either lens.
 HOUSINGS = CalibrateOptions(refine_water_index=True, baseline_stddev_m=0.002)
@@ -247,11 +248,13 @@ def test_compiled_kernels_equal_their_python():
     state = State.from_scene(scene).kernel_state()
     fast = normal_equations.empty_normal_equations(layout)
     slow = normal_equations.empty_normal_equations(layout)
-    normal_equations.linearize(layout, state, error, 1, 3.0, fast)
-    chunk, sums = chunks.new_chunk(layout), assembly.new_sums(layout)
+    work = Workspace(layout)
+    normal_equations.linearize(work, state, error, 1, 3.0, fast)
+    sums = assembly.new_sums(layout, np.unique(layout.cell_frame))
+    chunk = chunks.new_chunk(layout, chunks.largest_chunk(layout))
     linearize_points = python_of(normal_equations._linearize_points)
     linearize_points(layout, state, 1, 3.0, 0, len(state.points), chunk, sums, slow)
-    normal_equations.scatter(layout, sums, slow)
+    normal_equations.scatter(layout, [sums], slow)
     for a, b in zip(fast, slow, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(a).max())
     graph = build_graph(layout)

@@ -6,36 +6,52 @@ import numpy as np
 
 from uwsfm._jit import inner_fused, lane
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import IndexArray
 from uwsfm.solver.chunks import COUPLING, GRAD, width
 from uwsfm.solver.layout import Layout
 
 
 class Sums(NamedTuple):
-    """What points share, summed over some of them; W columns for each of C cameras."""
+    """What points share, summed over some of them, which R frames see; W columns for
+    each of C cameras, B of them different."""
 
+    seen: IndexArray
+    """(R,) the frames, rising."""
+    row: IndexArray
+    """(F,) where they are in ``seen``."""
     frames: Array
-    """U (F, 6, 6)"""
+    """U (R, 6, 6)"""
     frames_grad: Array
-    """(F, 6)"""
+    """(R, 6)"""
     frames_border: Array
-    """(F, C W, 6): B^T, so that what is added together lies together."""
+    """(R, B, 6): transposed, so that what is added together lies together."""
     blocks: Array
     """(C, W, W + 1) of each camera against the residual, then itself."""
     of_point: Array
-    """(C W, 3) scratch: one point against the cameras."""
+    """(B, 3) scratch: one point against the cameras."""
 
 
-def new_sums(layout: Layout) -> Sums:
-    """Zeroed sums of the sizes of a layout."""
-    num_cameras, num_frames = len(layout.free_start) - 1, len(layout.frame_col)
-    w = width(layout)
+def new_sums(layout: Layout, seen: IndexArray) -> Sums:
+    """Sums over points that some frames (R,), rising, see."""
+    num_cameras, num_border = len(layout.free_start) - 1, layout.num_camera_cols
+    w, count = width(layout), len(seen)
+    row = np.full(len(layout.frame_col), -1, dtype=np.int64)
+    row[seen] = np.arange(count)
     return Sums(
-        frames=np.zeros((num_frames, 6, 6)),
-        frames_grad=np.zeros((num_frames, 6)),
-        frames_border=np.zeros((num_frames, num_cameras * w, 6)),
+        seen=seen,
+        row=row,
+        frames=np.zeros((count, 6, 6)),
+        frames_grad=np.zeros((count, 6)),
+        frames_border=np.zeros((count, num_border, 6)),
         blocks=np.zeros((num_cameras, w, w + 1)),
-        of_point=np.zeros((num_cameras * w, 3)),
+        of_point=np.zeros((num_border, 3)),
     )
+
+
+def clear(sums: Sums) -> None:
+    """Zero, for other points."""
+    for block in (sums.frames, sums.frames_grad, sums.frames_border, sums.blocks):
+        block[...] = 0.0
 
 
 @lane
@@ -45,11 +61,11 @@ def _torque(x, y, z, a, b, c):
 
 
 @inner_fused
-def _add_couplings(rows, j, num_free, x, y, z, frame, f, first_col, of_frame, of_point):
-    """What observation j couples to its camera: its frame f and its point."""
+def _add_couplings(rows, j, num_free, x, y, z, frame, f, cols, of_frame, of_point):
+    """What observation j couples to columns of its camera: its frame and its point."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
     for s in range(num_free):
-        at, col = COUPLING + 3 * s, first_col + s
+        at, col = COUPLING + 3 * s, cols[s]
         c0, c1, c2 = rows[j, at], rows[j, at + 1], rows[j, at + 2]
         t0, t1, t2 = _torque(x, y, z, c0, c1, c2)
         of_frame[f, col, 0] += t0
@@ -106,7 +122,7 @@ def add_cell(
     Args:
         x, y, z: the point in the rig.
         frame: from `rotation`.
-        p, c, f: point, cell and frame.
+        p, c, f: point, cell, and row of the frame in the sums.
         sums_of_cell: H (lower triangle) and g by the point in the rig, 9 scalars.
         frames, frames_grad: of `Sums`, added to.
         cells, grad, v: of `NormalEquations`; the cell's W is written.
@@ -161,36 +177,37 @@ def _sum_rows(rows, first, last):
 
 @inner_fused
 def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
-    """Add the rows of an evaluated chunk to the blocks of its points and the sums."""
-    rows, in_rig, w = chunk.rows, chunk.in_rig, sums.blocks.shape[1]
+    """Write the blocks of an evaluated chunk's points, and add its rows to the sums."""
+    rows, in_rig, row_of = chunk.rows, chunk.in_rig, sums.row
     # Named once, out of the loops: each look into a tuple of arrays counts references.
     frames, frames_grad, of_frame = sums.frames, sums.frames_grad, sums.frames_border
     of_point, poses, camera = sums.of_point, state.frames, layout.camera
     cells, grads, v, border = out.cells, out.points_grad, out.points, out.points_border
     point_start, cell_start = layout.point_start, layout.cell_start
     cell_frame, free_start = layout.cell_frame, layout.free_start
-    free_col = layout.free_col
+    free_col, num_border = layout.free_col, len(of_point)
     for p in range(first_point, last_point):
-        for k in range(len(of_point)):
-            for a in range(3):
+        for a in range(3):
+            for k in range(num_border):
                 of_point[k, a] = 0.0
+            grads[p, a], v[p, a, 0], v[p, a, 1], v[p, a, 2] = 0.0, 0.0, 0.0, 0.0
         for c in range(point_start[p], point_start[p + 1]):
             start, end = cell_start[c] - first, cell_start[c + 1] - first
-            f = cell_frame[c]
-            frame = rotation(poses, f)
+            frame, f = rotation(poses, cell_frame[c]), row_of[cell_frame[c]]
             x, y, z = in_rig[start, 0], in_rig[start, 1], in_rig[start, 2]
             total = _sum_rows(rows, start, end)
             add_cell(
                 x, y, z, frame, p, c, f, total, frames, frames_grad, cells, grads, v
             )
             for j in range(start, end):
-                k = camera[first + j]
-                num_free = free_start[k + 1] - free_start[k]
+                at = free_start[camera[first + j]]
+                num_free = free_start[camera[first + j] + 1] - at
+                cols = free_col[at:]
                 _add_couplings(
-                    rows, j, num_free, x, y, z, frame, f, k * w, of_frame, of_point
+                    rows, j, num_free, x, y, z, frame, f, cols, of_frame, of_point
                 )
-        for k in range(len(free_start) - 1):
-            at = free_start[k]
-            for s in range(free_start[k + 1] - at):
-                for a in range(3):
-                    border[p, a, free_col[at + s]] += of_point[k * w + s, a]
+        for a in range(3):
+            for k in range(num_border):
+                border[p, a, k] = of_point[k, a]
+            for k in range(num_border, border.shape[2]):
+                border[p, a, k] = 0.0

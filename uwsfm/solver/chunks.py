@@ -76,12 +76,15 @@ def width(layout: Layout) -> int:
     return int(np.diff(layout.free_start).max())
 
 
-def new_chunk(layout: Layout) -> Chunk:
-    """Scratch that the largest chunk of a layout fits in."""
-    num_cameras = len(layout.free_start) - 1
+def largest_chunk(layout: Layout) -> int:
+    """Observations of the largest chunk of a layout."""
     # One point may have more observations than a chunk should.
-    of_points = np.diff(layout.cell_start[layout.point_start])
-    largest = max(CHUNK, int(of_points.max()))
+    return max(CHUNK, int(np.diff(layout.cell_start[layout.point_start]).max()))
+
+
+def new_chunk(layout: Layout, largest: int) -> Chunk:
+    """Scratch for chunks of a layout, of at most so many observations."""
+    num_cameras = len(layout.free_start) - 1
     columns = COUPLING + 3 * width(layout)
     return Chunk(
         rows=np.zeros((largest, columns)),

@@ -1,13 +1,14 @@
 """Levenberg-Marquardt on the reduced system, with the policy the measurements chose."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property
-from typing import Protocol
+from functools import cache, cached_property
+from typing import Any, Protocol
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
@@ -28,6 +29,7 @@ from uwsfm.solver.reduction import DENSE, Reduction, analyse
 from uwsfm.solver.schur import ReducedSystem
 from uwsfm.solver.state import State
 from uwsfm.solver.threads import num_threads
+from uwsfm.solver.workspace import Workspace
 
 # Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
 SINGLE_BLAS_BELOW = 1500
@@ -120,6 +122,7 @@ class Problem:
         self.priors = priors
         self._loss = LOSS_CODES[options.loss]
         self._scale = options.loss_scale_px
+        self._work = Workspace(layout)
         self._eqs = empty_normal_equations(layout)
         self._system: ReducedSystem | None = None
 
@@ -131,19 +134,21 @@ class Problem:
     def cost(self, state: State) -> tuple[float, int]:
         """Robust cost, priors included, and the number of valid errors."""
         cost, valid = total_cost(
-            self.layout, state.kernel_state(), self.error, self._loss, self._scale
+            self._work, state.kernel_state(), self.error, self._loss, self._scale
         )
         if self.priors is not None:
             cost += self.priors.cost(state)
         return cost, valid
 
+    def squares(self, state: State) -> Array:
+        """Squared reprojection errors (N,) in the layout's order, px^2; NaN where
+        invalid. The array is used again by the next call and by `cost`."""
+        return squared_errors(self._work, state.kernel_state())
+
     def linearize(self, state: State) -> NormalEquations:
         """Normal equations at a state; the arrays are used again by the next call."""
-        for name, block in self._eqs._asdict().items():
-            if name != "cells":  # the largest; written, not added to
-                block[...] = 0.0
         linearize(
-            self.layout,
+            self._work,
             state.kernel_state(),
             self.error,
             self._loss,
@@ -178,27 +183,38 @@ class Problem:
         free = self.layout.frame_col != HELD
         offset = self.layout.num_frame_cols
         lengths = self.layout.num_unknowns - offset
-        diagonals = np.concatenate(
-            [
-                np.einsum("faa->fa", eqs.frames[free]).ravel(),
-                np.einsum("aa->a", eqs.border),
-                np.einsum("paa->pa", eqs.points).ravel(),
-            ]
-        )
-        misses = eqs.border_grad[lengths:]
-        before = float(np.sum(misses**2 / -np.einsum("aa->a", eqs.border)[lengths:]))
-        grads = [eqs.frames_grad[free].ravel(), eqs.border_grad]
-        gradient = np.concatenate([*grads, eqs.points_grad.ravel()])
-        delta = np.concatenate([step[:offset], step[offset:], points_step.ravel()])
-        scaled = damping * np.maximum(diagonals, MIN_DIAGONAL) * delta
-        scaled[self.layout.num_unknowns : len(step)] = 0.0
-        return 0.5 * (before + float(delta @ (scaled - gradient)))
+        stiff = np.einsum("aa->a", eqs.border)
+        before = np.sum(eqs.border_grad[lengths:] ** 2 / -stiff[lengths:])
+        frames = np.einsum("faa->fa", eqs.frames)[free]
+        points = np.einsum("paa->pa", eqs.points)
+        total = float(before) - float(step[offset:] @ eqs.border_grad)
+        total += _damped(damping, stiff[:lengths], step[offset:][:lengths])
+        for diagonal, grad, delta in (
+            (frames, eqs.frames_grad[free], step[:offset].reshape(-1, 6)),
+            (points, eqs.points_grad, points_step),
+        ):
+            total += _damped(damping, diagonal, delta)
+            total -= float(np.vdot(delta, grad))
+        return 0.5 * total
+
+
+def _damped(damping: float, diagonal: Array, delta: Array) -> float:
+    """lambda delta^T D delta."""
+    weighed = np.maximum(diagonal, MIN_DIAGONAL)
+    weighed *= delta
+    return damping * float(np.vdot(weighed, delta))
 
 
 Report = Callable[[int, float], None]
 
 
-def suitable_blas(reduction: Reduction) -> threadpool_limits:
+@cache
+def _libraries() -> ThreadpoolController:
+    """Found once: looking for them takes a millisecond."""
+    return ThreadpoolController()
+
+
+def suitable_blas(reduction: Reduction) -> AbstractContextManager[Any]:
     """A context with as many BLAS threads as a reduced system is worth.
 
     One for bands and fronts, of which most are small.
@@ -206,7 +222,8 @@ def suitable_blas(reduction: Reduction) -> threadpool_limits:
     layout = reduction.layout
     size = layout.num_frame_cols + layout.num_border_cols
     large = reduction.kind == DENSE and size >= SINGLE_BLAS_BELOW
-    return threadpool_limits(num_threads() if large else 1, user_api="blas")
+    limit = num_threads() if large else 1
+    return _libraries().limit(limits=limit, user_api="blas")
 
 
 def minimize(
@@ -277,11 +294,10 @@ def _iterate(
         if damping > 1e12:
             stop = Stop.STALLED
             break
-    squares = squared_errors(problem.layout, state.kernel_state())
     return LevenbergMarquardtResult(
         state=state,
         cost=cost,
-        squares=squares,
+        squares=problem.squares(state),
         num_iterations=iterations,
         stop=stop,
     )

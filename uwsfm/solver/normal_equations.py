@@ -17,8 +17,7 @@ from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
-from uwsfm.scene import IndexArray
-from uwsfm.solver.assembly import Sums, add_cell, assemble, new_sums, rotation
+from uwsfm.solver.assembly import Sums, add_cell, assemble, clear, rotation
 from uwsfm.solver.cells import (
     add_point_3d,
     add_virtual_camera,
@@ -31,20 +30,19 @@ from uwsfm.solver.chunks import (
     evaluate,
     evaluate_with_jac,
     gather,
-    new_chunk,
 )
 from uwsfm.solver.error_models import POINT_3D, REPROJECTION, ErrorModel
 from uwsfm.solver.layout import Layout
 from uwsfm.solver.losses import L2
 from uwsfm.solver.state import KernelState
-from uwsfm.solver.threads import chunk_bounds, run_chunks
+from uwsfm.solver.threads import run_chunks
+from uwsfm.solver.workspace import Workspace
 
 MIN_DIAGONAL = 1e-6
 
-PART = 20_000
-"""Observations that are worth a thread: two milliseconds."""
-MAX_PARTS = 16
-"""Each needs sums of its own, 6 (7 + B) numbers per frame."""
+_WRITTEN = ("cells", "points")
+"""Blocks, by the starts of their names, that are written and not added to: the first of
+any error, the second of errors in the image only."""
 
 
 class NormalEquations(NamedTuple):
@@ -175,16 +173,6 @@ def _linearize_in_space(layout, state, error, loss, scale, out):
     scatter_blocks(layout, work, out)
 
 
-def _parts(layout: Layout) -> IndexArray:
-    """Bounds of the points' parts, for threads.
-
-    They depend on the problem alone, and parts are summed in their order: results are
-    the same for any number of threads.
-    """
-    count = min(MAX_PARTS, 1 + len(layout.xy) // PART)
-    return chunk_bounds(layout.cell_start[layout.point_start], count)
-
-
 @kernel
 def _linearize_points(layout, state, loss, scale, begin, end, chunk, sums, out):
     """Reprojection errors of points begin to end: their blocks, and sums."""
@@ -197,49 +185,51 @@ def _linearize_points(layout, state, loss, scale, begin, end, chunk, sums, out):
         p = last
 
 
-def scatter(layout: Layout, sums: Sums, out: NormalEquations) -> None:
-    """Add sums to the normal equations, where cameras may share border columns."""
-    out.frames[:] += sums.frames
-    out.frames_grad[:] += sums.frames_grad
-    w = sums.blocks.shape[1]
+def scatter(layout: Layout, parts: list[Sums], out: NormalEquations) -> None:
+    """Sum parts up in their order; cameras may share border columns."""
+    cameras = layout.num_camera_cols
+    for sums in parts:
+        out.frames[sums.seen] += sums.frames
+        out.frames_grad[sums.seen] += sums.frames_grad
+        of_frames = np.swapaxes(sums.frames_border, 1, 2)
+        out.frames_border[sums.seen, :, :cameras] += of_frames
+    blocks = np.sum([sums.blocks for sums in parts], axis=0)
     for k in range(len(layout.free_start) - 1):
         cols = layout.free_col[layout.free_start[k] : layout.free_start[k + 1]]
-        block = sums.blocks[k, : len(cols), 1 : len(cols) + 1]
-        lower = np.tril(block)
+        lower = np.tril(blocks[k, : len(cols), 1 : len(cols) + 1])
         # fx and fy of one camera may share a column.
         np.add.at(out.border, np.ix_(cols, cols), lower + np.tril(lower, -1).T)
-        np.add.at(out.border_grad, cols, sums.blocks[k, : len(cols), 0])
-        for s, col in enumerate(cols):
-            out.frames_border[:, :, col] += sums.frames_border[:, k * w + s]
+        np.add.at(out.border_grad, cols, blocks[k, : len(cols), 0])
 
 
 def linearize(
-    layout: Layout,
+    work: Workspace,
     state: KernelState,
     error: ErrorModel,
     loss: int,
     scale: float,
     out: NormalEquations,
 ) -> None:
-    """Fill `NormalEquations` at a state, with weights rho'(s).
-
-    All blocks but the cells must be zero before.
-    """
-    if error.code != REPROJECTION:
-        _linearize_in_space(layout, state, error, loss, scale, out)
+    """Fill `NormalEquations` at a state, with weights rho'(s)."""
+    in_image = error.code == REPROJECTION
+    for name, block in out._asdict().items():
+        if not name.startswith(_WRITTEN if in_image else _WRITTEN[:1]):
+            block[...] = 0.0
+    if not in_image:
+        _linearize_in_space(work.layout, state, error, loss, scale, out)
         return
-    bounds = _parts(layout)
-    sums = [new_sums(layout) for _ in bounds[1:]]
 
     def add_part(part: int) -> None:
-        begin, end, chunk = bounds[part], bounds[part + 1], new_chunk(layout)
-        _linearize_points(
-            layout, state, loss, scale, begin, end, chunk, sums[part], out
-        )
+        begin, end = work.bounds[part : part + 2]
+        sums = work.sums[part]
+        clear(sums)
+        with work.chunk() as chunk:
+            _linearize_points(
+                work.layout, state, loss, scale, begin, end, chunk, sums, out
+            )
 
-    run_chunks(add_part, len(sums))
-    for part_sums in sums:
-        scatter(layout, part_sums, out)
+    run_chunks(add_part, len(work.sums))
+    scatter(work.layout, work.sums, out)
 
 
 @kernel
@@ -272,32 +262,38 @@ def _cost_of_points(layout, state, loss, scale, begin, end, chunk, squares):
 
 
 def _image_cost(
-    layout: Layout, state: KernelState, loss: int, scale: float
-) -> tuple[float, int, Array]:
-    """Cost, number of valid errors and squared errors of the reprojection error."""
-    bounds, squares = _parts(layout), np.empty(len(layout.xy))
-    costs = [(0.0, 0)] * (len(bounds) - 1)
+    work: Workspace, state: KernelState, loss: int, scale: float
+) -> tuple[float, int]:
+    """Cost and number of valid errors of the reprojection error; `work.squares`."""
+    costs, squares = [(0.0, 0)] * work.num_parts, work.squares
+    work.set_state(None)
 
     def add_part(part: int) -> None:
-        begin, end, chunk = bounds[part], bounds[part + 1], new_chunk(layout)
-        costs[part] = _cost_of_points(
-            layout, state, loss, scale, begin, end, chunk, squares
-        )
+        begin, end = work.bounds[part : part + 2]
+        with work.chunk() as chunk:
+            costs[part] = _cost_of_points(
+                work.layout, state, loss, scale, begin, end, chunk, squares
+            )
 
     run_chunks(add_part, len(costs))
-    return sum(cost for cost, _ in costs), sum(valid for _, valid in costs), squares
+    work.set_state(state)
+    return sum(cost for cost, _ in costs), sum(valid for _, valid in costs)
 
 
 def total_cost(
-    layout: Layout, state: KernelState, error: ErrorModel, loss: int, scale: float
+    work: Workspace, state: KernelState, error: ErrorModel, loss: int, scale: float
 ) -> tuple[float, int]:
     """(Robust cost 0.5 sum rho(|e|^2) in pixels squared, number of valid errors)."""
     if error.code != REPROJECTION:
-        return _cost_in_space(layout, state, error, loss, scale)
-    cost, valid, _ = _image_cost(layout, state, loss, scale)
-    return cost, valid
+        return _cost_in_space(work.layout, state, error, loss, scale)
+    return _image_cost(work, state, loss, scale)
 
 
-def squared_errors(layout: Layout, state: KernelState) -> Array:
-    """Squared reprojection errors (N,) in sorted order, px^2; NaN where invalid."""
-    return _image_cost(layout, state, L2, 1.0)[2]
+def squared_errors(work: Workspace, state: KernelState) -> Array:
+    """Squared reprojection errors (N,) in sorted order, px^2; NaN where invalid.
+
+    The array belongs to the workspace.
+    """
+    if work.squares_at(state) is None:
+        _image_cost(work, state, L2, 1.0)
+    return work.squares

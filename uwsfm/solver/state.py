@@ -1,6 +1,7 @@
 """The values a bundle adjustment moves, and how a step moves them."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +91,11 @@ class State:
         return np.linalg.norm(self.cam_from_rig[:, 4:], axis=1)
 
     def kernel_state(self) -> KernelState:
+        """The same object whenever it is asked for."""
+        return self._rows
+
+    @cached_property
+    def _rows(self) -> KernelState:
         return KernelState(
             frames=rigid3.matrix_rows(self.rig_from_world),
             cams=rigid3.matrix_rows(self.cam_from_rig),
