@@ -76,13 +76,23 @@ def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
     assert counts[2] in (1, 2)
 
 
-def test_an_address_that_is_none_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(InputError, match="scheduler must be .* got 'nonsense'"):
+@pytest.mark.parametrize(
+    ("scheduler", "refusal"),
+    [
+        ("nonsense", "scheduler must be .* got 'nonsense'"),
+        ("tcp://127.0.0.1:1", "no Dask scheduler answers at tcp://127.0.0.1:1"),
+    ],
+)
+def test_where_no_scheduler_is_nothing_is_written(
+    scheduler, refusal, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("uwsfm.tasks.CONNECT_SECONDS", 1)  # a refusal takes none
+    with pytest.raises(InputError, match=refusal):
         uwsfm.reconstruct(
             sample_dir() / "rig.yaml",
             sample_dir() / "images",
             tmp_path / "out",
-            scheduler="nonsense",
+            scheduler=scheduler,
         )
     assert not (tmp_path / "out").exists()
 

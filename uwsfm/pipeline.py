@@ -58,7 +58,7 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.tasks import LOCAL
+from uwsfm.tasks import LOCAL, Workers
 
 WORK = "uwsfm-work"
 """Folder inside the output folder where the steps keep their results."""
@@ -154,6 +154,8 @@ def reconstruct(
     frames = find_frames(Path(images), rig)
     known = KnownLengths.read(lengths, positions, lever_arm)
     known.check_names(rig, frames.names)
+    with Workers(scheduler):  # whether a scheduler answers, and has a worker
+        pass
     with locked(out):
         job = _Job(rig, Path(images), out, options, known, calibration, progress)
         return job.run()

@@ -32,7 +32,7 @@ logging.getLogger("distributed").setLevel(logging.WARNING)
 LOCAL = "local"
 RETRIES = 2
 """Of a task that fails for another reason than its input: a full disk, say."""
-CONNECT_SECONDS = 10
+CONNECT_SECONDS = 5
 ORPHANED = "30s"
 """Without a task, after which processes of this machine end: whoever started them was
 killed."""
