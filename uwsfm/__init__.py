@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.uncertainty import predict_covariance
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
+    from uwsfm.dense.run import dense_cloud
     from uwsfm.errors import InputError, UwsfmError
     from uwsfm.export.files import export_colmap, export_ply, read_model
     from uwsfm.export.housing import export_housing
@@ -70,6 +71,7 @@ _HOMES = {
     "perspective_adjustment": "uwsfm.calibration.perspective",
     "predict_covariance": "uwsfm.calibration.uncertainty",
     "verdicts": "uwsfm.calibration.observability",
+    "dense_cloud": "uwsfm.dense.run",
     "export_colmap": "uwsfm.export.files",
     "export_housing": "uwsfm.export.housing",
     "export_pinhole": "uwsfm.export.pinhole_files",
@@ -109,6 +111,7 @@ __all__ = [
     "UwsfmError",
     "calibrate",
     "calibrate_housing",
+    "dense_cloud",
     "error_budget",
     "export_colmap",
     "export_housing",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from uwsfm.cli_batch import batch
+from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
 from uwsfm.cli_options import (
     LengthsOption,
@@ -43,6 +44,7 @@ app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
+app.command()(dense)
 app.command()(clean)
 app.command("map")(map_)
 

@@ -23,6 +23,7 @@ from uwsfm.export.files import (
     POINTS,
     SPARSE,
     SUMMARY,
+    WORK,
     export_colmap,
     export_ply,
 )
@@ -60,8 +61,6 @@ from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
 
-WORK = "uwsfm-work"
-"""Folder inside the output folder where the steps keep their results."""
 LOCK = "lock"
 
 

@@ -25,6 +25,8 @@ SPARSE, HOUSING, POINTS, SUMMARY = (
     "points.ply",
     "summary.json",
 )
+WORK = "uwsfm-work"
+"""Folder inside the output folder where the steps keep their results."""
 
 
 def read_model(folder: str | Path) -> Model:

@@ -1,0 +1,185 @@
+"""Depth maps that confirm each other, voxels, and the calibration's share of errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from dense_scenes import Plane
+
+from uwsfm.calibration.uncertainty import predict_covariance
+from uwsfm.dense.calibration_error import CalibrationError
+from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
+from uwsfm.dense.fuse import fuse, noise_px, placed, robust_stddev
+from uwsfm.dense.options import bytes_of
+from uwsfm.dense.voxels import Fused, Voxels
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import closest_points
+from uwsfm.residuals import border
+from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
+from uwsfm.simulate.rigs import sample_rig
+from uwsfm.simulate.trajectories import level_poses, rich_motion
+
+NOISE_PX = 0.2
+SENSITIVITY = 0.01  # metres per pixel, about that of the sample at two metres
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, 0.01)
+
+
+def maps_of_floor(rng: np.random.Generator, num: int, bump: float = 0.0):
+    """Depth maps of the plane z = 0 with noise; the last one sees a bump on it."""
+    camera = sample_rig(image_scale=0.1).refractive_cameras()[0]
+    poses = level_poses(
+        np.column_stack([0.1 * np.arange(num), np.zeros(num), np.full(num, -1.5)]),
+        20.0 * np.arange(num),
+    )
+    origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
+    shape = camera.height, camera.width
+    found = []
+    for index, pose in enumerate(poses):
+        world_from_cam = rigid3.inverse(pose)
+        ranges = FLOOR.ranges(
+            rigid3.transform(world_from_cam, origins),
+            rigid3.rotate(world_from_cam, dirs),
+        ).reshape(shape)
+        ranges += NOISE_PX * SENSITIVITY * rng.standard_normal(shape)
+        if bump and index == num - 1:
+            ranges[20:40, 20:40] -= bump
+        constant = np.full(shape, SENSITIVITY, dtype=np.float32)
+        calibration = np.zeros(shape, dtype=np.float32)
+        found.append(placed(camera, pose, ranges.astype("f4"), constant, calibration))
+    return found
+
+
+def test_depth_maps_tell_their_noise_and_average_it(rng: np.random.Generator):
+    maps = maps_of_floor(rng, 5)
+    found = robust_stddev(
+        np.concatenate([noise_px(view, maps[:i]) for i, view in enumerate(maps)])
+    )
+    # Lookups between pixels average up to four of the other map's: 2/3 of a variance
+    # on average and in each direction, (1 + 4/9) / 2 of both together.
+    assert found == pytest.approx(NOISE_PX * np.sqrt(13.0 / 18.0), rel=0.1)
+    image = np.zeros((60, 80, 3), dtype=np.uint8)
+    fused, counts = fuse(
+        maps[0], maps[1:], image, NOISE_PX, min_views=3, keep_single=False
+    )
+    all_agree = fused.num_views == 5
+    height = fused.points[all_agree, 2]
+    # Along the line of sight, whose slope is small; five maps, of which four are
+    # interpolated: below the standard deviation said, by less than a half.
+    ratio = np.std(height) / np.median(fused.stddev[all_agree])
+    assert 0.5 < ratio < 1.1
+    assert fused.stddev[all_agree] == pytest.approx(
+        NOISE_PX * SENSITIVITY / np.sqrt(5.0), rel=0.2
+    )
+    assert counts.num_contradicted < 0.02 * counts.num_points
+    # The floor's normal, up into the water.
+    assert np.median(fused.normals[:, 2]) < -0.99
+
+
+def test_what_others_contradict_is_dropped(rng: np.random.Generator):
+    maps = maps_of_floor(rng, 4, bump=0.1)
+    image = np.zeros((60, 80, 3), dtype=np.uint8)
+    image[..., 0] = 200  # blue
+    rule = {"min_views": 2, "keep_single": True}
+    fused, counts = fuse(maps[3], maps[:3], image, NOISE_PX, **rule)
+    # Ten standard deviations off; its border has no normal.
+    assert counts.num_contradicted >= 250
+    assert np.all(np.abs(fused.points[:, 2]) < 0.03)
+    assert np.all(fused.colors == [0, 0, 200])
+    alone, _ = fuse(maps[3], [], image, NOISE_PX, **rule)
+    assert np.all(alone.num_views == 1) and len(alone) > 4000
+    nothing, _ = fuse(maps[3], [], image, NOISE_PX, min_views=2, keep_single=False)
+    assert len(nothing) == 0
+
+
+def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
+    count = 500
+    # A real survey's coordinates: single precision has 3 cm there.
+    origin = np.array([4e5, 5e6, -20.0])
+    points = origin + rng.uniform(0.0, 0.1, (count, 3))
+    fused = Fused(
+        points=points,
+        normals=np.tile([0.0, 0.0, -1.0], (count, 1)),
+        colors=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        stddev=rng.uniform(0.001, 0.002, count),
+        num_views=rng.integers(2, 9, count),
+        view_range=rng.uniform(1.0, 2.0, count),
+    )
+    voxels = Voxels(0.05, origin, 1e9)
+    for part in np.array_split(np.arange(count), 7):
+        voxels.add(Fused(**{name: v[part] for name, v in vars(fused).items()}))
+    cloud = voxels.cloud()
+    cells = np.floor((points - origin) / 0.05).astype(int)
+    keys = [tuple(key) for key in np.unique(cells, axis=0)]
+    assert len(cloud) == len(keys) == 8
+    for key in keys:
+        rows = np.flatnonzero(np.all(cells == key, axis=1))
+        weight = fused.stddev[rows] ** -2
+        mean = np.average(points[rows], axis=0, weights=weight)
+        i = int(np.argmin(np.linalg.norm(cloud.points - mean, axis=1)))
+        # Double precision at 5000 km is a nanometre, and the oracle sums there.
+        np.testing.assert_allclose(cloud.points[i], mean, rtol=0.0, atol=1e-8)
+        nearest = rows[np.argmin(fused.view_range[rows])]
+        np.testing.assert_array_equal(cloud.colors[i], fused.colors[nearest])
+        assert cloud.num_views[i] == fused.num_views[rows].max()
+        # Neighbours share their errors: no point is better than its parts.
+        assert cloud.stddev[i] >= fused.stddev[rows].min()
+    with pytest.raises(InputError, match="choose a larger --voxel"):
+        Voxels(1e-9, origin, 1e9).add(fused)
+    few = Voxels(0.001, origin, 1e3)
+    few.add(fused)
+    with pytest.raises(InputError, match="do not fit the memory"):
+        few.cloud()
+
+
+def test_an_uncertain_port_makes_the_depths_uncertain():
+    scene = simulate_scene(
+        sample_rig(),
+        rich_motion(4),
+        Relief(stddev=0.1),
+        ObservationOptions(num_points=60, noise_px=0.0),
+    ).truth
+    covariance = predict_covariance(scene, 0.5)
+    # Only the distance of the right port, by 2 mm.
+    column = covariance.border_cols[1, border.DISTANCE]
+    only = np.zeros_like(covariance.border)
+    only[column, column] = 0.002**2
+    found = CalibrationError(scene, replace(covariance, border=only), (0, 1), 1.0, 3.0)
+    left, right = scene.cameras
+    xy, ranges = np.array([[400.0, 300.0], [250.0, 200.0]]), np.array([1.5, 2.2])
+    pose = scene.cam_from_rig[1]
+    origins, dirs = left.ray_from_img(xy)
+    shown, _ = right.img_from_point(
+        rigid3.transform(pose, origins + ranges[:, None] * dirs)
+    )
+    port = replace(right.port, distance=right.port.distance + 0.002)
+    starts, ways = right.with_port(port).ray_from_img(shown)
+    back = rigid3.inverse(pose)
+    moved = closest_points(
+        origins, dirs, rigid3.transform(back, starts), rigid3.rotate(back, ways)
+    )[1][:, 0]
+    # Between the nodes of the grid, and to first order.
+    np.testing.assert_allclose(
+        found.stddev(xy, ranges), np.abs(moved - ranges), rtol=0.1, atol=1e-5
+    )
+
+
+def test_depth_maps_come_back_or_are_made_again(tmp_path):
+    depth = DepthMap(
+        ranges=np.ones((3, 4), dtype="f4"), sensitivity=np.ones((3, 4), dtype="f4")
+    )
+    path = tmp_path / "work" / "map.npz"
+    assert read_depth_map(path, "key") is None
+    write_depth_map(depth, path, "key")
+    found = read_depth_map(path, "key")
+    assert found is not None and np.array_equal(found.ranges, depth.ranges)
+    assert read_depth_map(path, "other") is None
+    path.write_bytes(path.read_bytes()[:200])
+    assert read_depth_map(path, "key") is None
+
+
+def test_sizes_are_read():
+    assert bytes_of("2GB") == 2e9 and bytes_of(" 500 M") == 5e8 and bytes_of("1e9")
+    for text in ("", "much", "2TB", "-1GB"):
+        with pytest.raises(InputError, match="is no size"):
+            bytes_of(text)

@@ -1,0 +1,76 @@
+"""`uwsfm dense` from a result folder to the cloud."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from dense_scenes import DenseDive, dense_dive
+from typer.testing import CliRunner
+
+import uwsfm
+from uwsfm.cli import app
+from uwsfm.dense import run
+from uwsfm.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory: pytest.TempPathFactory) -> DenseDive:
+    return dense_dive(tmp_path_factory.mktemp("dense"))
+
+
+def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
+    made: list[int] = []
+    original = run.stereo_depth
+
+    def stopped_at(limit: int):
+        def counted(*arguments):
+            if len(made) == limit:
+                raise KeyboardInterrupt
+            made.append(1)
+            return original(*arguments)
+
+        monkeypatch.setattr(run, "stereo_depth", counted)
+
+    stopped_at(2)
+    with pytest.raises(KeyboardInterrupt):
+        uwsfm.dense_cloud(dive.out, dive.images, num_threads=1)
+    assert len(made) == 2 and not (dive.out / "dense").exists()
+    # The same command goes on: the first two are kept.
+    stopped_at(3)
+    done = CliRunner().invoke(
+        app, ["dense", str(dive.out), "--images", str(dive.images)]
+    )
+    assert done.exit_code == 0, done.output
+    cloud = uwsfm.read_cloud(dive.out / "dense" / "cloud.ply")
+    summary = json.loads((dive.out / "dense" / "summary.json").read_text())
+    assert summary["num_points"] == len(cloud) > 20_000
+    assert summary["unit"] == "metre"
+    assert summary["noise_from"] == "differences between depth maps"
+    assert summary["calibration_stddev_max"]["0-1"] > 0.0
+    middle = cloud.points.mean(axis=0)
+    normal = np.linalg.svd(cloud.points - middle, full_matrices=False)[2][2]
+    height = (cloud.points - middle) @ normal
+    # What the cloud says of itself holds.
+    assert np.sqrt(np.mean(height**2)) < 1.5 * np.median(cloud.stddev)
+    assert np.median(np.abs(cloud.normals @ normal)) > 0.99
+    assert np.all(cloud.num_views >= 2)
+
+
+def test_wrong_input_is_told_in_one_sentence(dive: DenseDive, tmp_path):
+    images = tmp_path / "images"
+    shutil.copytree(dive.images, images)
+    first = next(iter(sorted((images / "left").iterdir())))
+    for options, words in (
+        ({"max_memory": 1e7}, "--max-memory 0.01GB is too little"),
+        ({"voxels": 1}, "unknown option voxels"),
+        ({"noise_px": -1.0}, "noise_px must be positive"),
+    ):
+        with pytest.raises(InputError, match=words):
+            uwsfm.dense_cloud(dive.out, images, **options)
+    with pytest.raises(InputError, match="say with --images"):
+        uwsfm.dense_cloud(dive.out)
+    os.replace(first, tmp_path / "away")
+    with pytest.raises(InputError, match=f"{first.name}"):
+        uwsfm.dense_cloud(dive.out, images)

@@ -1,0 +1,102 @@
+"""`uwsfm dense`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def dense(
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="The output of uwsfm reconstruct or uwsfm refine."
+        ),
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="The images' folder, if they were moved.", show_default=False
+        ),
+    ] = None,
+    voxel: Annotated[
+        float | None,
+        typer.Option(
+            help="Side of the voxels that points are merged in, in the unit of the "
+            "model; by default the footprint of a pixel.",
+            show_default=False,
+        ),
+    ] = None,
+    min_views: Annotated[
+        int, typer.Option(min=1, help="Depth maps that have to agree on a point.")
+    ] = 2,
+    keep_single: Annotated[
+        bool, typer.Option(help="Keep also what one depth map alone sees.")
+    ] = False,
+    noise_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of a disparity; by default from the differences "
+            "between depth maps.",
+            show_default=False,
+        ),
+    ] = None,
+    max_memory: Annotated[
+        str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
+    ] = "2GB",
+    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+) -> None:
+    """Make a dense cloud: every pixel's depth along its exact water ray.
+
+    Run the same command again to go on with a run that was stopped.
+    """
+    from uwsfm.console import ProgressBars, console
+    from uwsfm.dense.options import bytes_of
+    from uwsfm.dense.run import dense_cloud
+
+    with ProgressBars() as progress:
+        result = dense_cloud(
+            out,
+            images,
+            progress=progress,
+            voxel=voxel,
+            min_views=min_views,
+            keep_single=keep_single,
+            noise_px=noise_px,
+            max_memory=bytes_of(max_memory),
+            num_threads=threads,
+        )
+    console.print(_table(result.summary))
+    typer.echo(f"wrote {result.path}")
+
+
+def _table(summary: dict[str, Any]) -> "Table":
+    """What the cloud holds, and how well its points are known."""
+    from rich.table import Table
+
+    unit = summary["unit"]
+    table = Table(title="Dense cloud", title_justify="left", show_header=False)
+    maps = summary["depth_maps"]
+    shares = [entry["share_matched"] for entry in maps]
+    slabs = sum(entry["num_slabs"] > 1 for entry in maps)
+    table.add_row("depth maps", f"{len(maps)}")
+    table.add_row("pixels with a depth", f"{100 * sum(shares) / len(shares):.0f} %")
+    table.add_row("depth range split", f"in {slabs} of them")
+    table.add_row("confirmed by others", f"{summary['num_confirmed']}")
+    table.add_row("contradicted", f"{summary['num_contradicted']}")
+    table.add_row("seen by too few", f"{summary['num_unchecked']}")
+    table.add_row("points", f"{summary['num_points']}")
+    table.add_row("voxel", f"{summary['voxel']:.2g} ({unit})")
+    table.add_row(
+        "noise of a disparity", f"{summary['noise_px']:.2f} px, {summary['noise_from']}"
+    )
+    spread = summary["stddev_percentiles"]
+    known = [v for v in summary["calibration_stddev_max"].values() if v is not None]
+    label = "standard deviation, 5 50 95 %"
+    if not known:
+        label += ", calibration not counted"
+    table.add_row(label, " ".join(f"{value:.2g}" for value in spread.values()))
+    return table

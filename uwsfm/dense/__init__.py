@@ -1,0 +1,1 @@
+"""Dense clouds: depth maps from water rays, fused."""

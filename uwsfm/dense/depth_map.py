@@ -1,0 +1,84 @@
+"""Depth of every pixel of an image, along its exact water ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm._files import replaced_file
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+
+# OpenCV's functions return arrays of any type, as far as type checkers know.
+Plane = NDArray[Any]
+"""(h, w) float32"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthMap:
+    """What one image's pixels (H, W) see; NaN where nothing was matched."""
+
+    ranges: Plane
+    """From the outer surface of the port along the water ray, metres."""
+    sensitivity: Plane
+    """Change of the range per pixel of disparity, metres."""
+
+    @property
+    def num_valid(self) -> int:
+        return int(np.count_nonzero(np.isfinite(self.ranges)))
+
+
+def pixel_rows(camera: RefractiveCamera, first: int, last: int, step: int = 1) -> Array:
+    """Centres (N, 2) of the pixels in rows first to last - 1, every step-th."""
+    x = np.arange(0, camera.width, step) + 0.5
+    y = np.arange(first, last, step) + 0.5
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def sampled(plane: Plane, at: Plane, *, nearest: bool = False) -> Plane:
+    """Values (h, w) of a plane at places (h, w, 2), pixel centres at integers.
+
+    Bilinear, or of the nearest pixel; NaN outside and beside NaN.
+    """
+    found = cv2.remap(
+        plane,
+        at[..., 0],
+        at[..., 1],
+        cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),
+    )
+    return np.asarray(found)
+
+
+def write_depth_map(depth: DepthMap, path: Path, key: str) -> None:
+    """Write a depth map with a key that tells what it was made of."""
+    with replaced_file(path) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            key=np.array(key),
+            ranges=depth.ranges,
+            sensitivity=depth.sensitivity,
+        )
+
+
+def read_depth_map(path: Path, key: str) -> DepthMap | None:
+    """Read a depth map; None if it is not there or of another key.
+
+    A file that was cut short counts as absent: it is made again.
+    """
+    try:
+        with np.load(path) as content:
+            if str(content["key"]) != key:
+                return None
+            return DepthMap(
+                ranges=content["ranges"], sensitivity=content["sensitivity"]
+            )
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None

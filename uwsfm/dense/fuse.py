@@ -1,0 +1,285 @@
+"""Depth maps against each other: what others confirm is kept, and averaged.
+
+Every point of a depth map is projected exactly into the images of its neighbours and
+compared with what their depth maps say there, in units of both standard deviations.
+Those that agree move it along its own line of sight, by inverse variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm.dense.depth_map import Plane, pixel_rows, sampled
+from uwsfm.dense.voxels import Fused
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+
+AGREE_STDDEVS = 3.0
+FOLD = 4096
+_NORMAL_REACH = 2
+"""Pixels on each side whose points give the normal."""
+_MAX_SLANT = 0.15
+"""Cosine between surface and line of sight; flatter than that means a step."""
+_BLOCK = 400_000
+"""Points compared at a time."""
+_SAMPLE_STEP = 4
+_MIN_SAMPLES = 2000
+_GATE_PX = 2.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placed:
+    """A depth map in the world."""
+
+    camera: RefractiveCamera
+    cam_from_world: Array
+    """(7,)"""
+    points: NDArray[np.float32]
+    """(H, W, 3) in the camera; NaN where there are none."""
+    distance: Plane
+    """(H, W) of the points from the projection centre."""
+    sensitivity: Plane
+    """(H, W) metres per pixel of disparity."""
+    calibration: Plane
+    """(H, W) standard deviation from the calibration, metres; zero if it has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseCounts:
+    num_points: int
+    """Of the depth map."""
+    num_confirmed: int
+    num_contradicted: int
+    """Other depth maps see something else there."""
+    num_unchecked: int
+    """Too few other depth maps see anything there."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Told:
+    """What another depth map says of points (N,); NaN where nothing."""
+
+    difference: Array
+    """Its distance minus that of the point, metres."""
+    sensitivity: Array
+    sight: Array
+    """(N, 3) unit, from the other camera to the point, in the world."""
+
+
+def noise_px(view: Placed, others: list[Placed]) -> Array:
+    """Differences between depth maps in pixels of disparity, of both together (n,).
+
+    Where both see the same surface their spread is the noise of one disparity.
+    """
+    rows = np.arange(0, view.distance.shape[0], _SAMPLE_STEP)
+    columns = np.arange(0, view.distance.shape[1], _SAMPLE_STEP)
+    grid = np.ix_(rows, columns)
+    points = view.points[grid].reshape(-1, 3).astype(np.float64)
+    own = view.sensitivity[grid].ravel()
+    keep = np.isfinite(points[:, 0])
+    in_world = rigid3.transform(rigid3.inverse(view.cam_from_world), points[keep])
+    found = []
+    for other in others:
+        told = _told(other, in_world)
+        both = np.hypot(own[keep], told.sensitivity)
+        found.append(told.difference / both)
+    all_px = np.concatenate(found) if found else np.empty(0)
+    with np.errstate(invalid="ignore"):
+        return all_px[np.abs(all_px) < _GATE_PX]
+
+
+def robust_stddev(values: Array) -> float | None:
+    """Of a sample around zero, from its median; None if it is too small to tell."""
+    if len(values) < _MIN_SAMPLES:
+        return None
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def fuse(
+    view: Placed,
+    others: list[Placed],
+    image: NDArray[np.uint8],
+    noise: float,
+    *,
+    min_views: int,
+    keep_single: bool,
+) -> tuple[Fused, FuseCounts]:
+    """The points of a depth map that others confirm, and what they agree upon.
+
+    Args:
+        view: the depth map.
+        others: its neighbours.
+        image: (H, W, 3) of the view, blue, green, red.
+        noise: standard deviation of a disparity, pixels.
+        min_views: depth maps that have to agree, this one included.
+        keep_single: whether to keep what no other depth map sees at all.
+    """
+    normals = normals_of(view)
+    keep = np.isfinite(view.distance) & np.isfinite(normals[..., 0])
+    where = np.flatnonzero(keep)
+    parts, totals = [], np.zeros(3, dtype=np.int64)
+    for first in range(0, len(where), _BLOCK):
+        block = where[first : first + _BLOCK]
+        part, counts = _fused(
+            view, others, image, normals, block, noise, (min_views, keep_single)
+        )
+        parts.append(part)
+        totals += counts
+    names = Fused.__dataclass_fields__
+    if not parts:
+        parts = [_empty()]
+    joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
+    confirmed, contradicted, unchecked = (int(total) for total in totals)
+    return Fused(**joined), FuseCounts(
+        num_points=int(np.count_nonzero(np.isfinite(view.distance))),
+        num_confirmed=confirmed,
+        num_contradicted=contradicted,
+        num_unchecked=unchecked,
+    )
+
+
+def _fused(
+    view: Placed,
+    others: list[Placed],
+    image: NDArray[np.uint8],
+    all_normals: NDArray[np.float32],
+    block: NDArray[np.int64],
+    noise: float,
+    rule: tuple[int, bool],
+) -> tuple[Fused, NDArray[np.int64]]:
+    """Some of the pixels of a depth map."""
+    min_views, keep_single = rule
+    world_from_cam = rigid3.inverse(view.cam_from_world)
+    in_cam = view.points.reshape(-1, 3)[block].astype(np.float64)
+    sensitivity = view.sensitivity.ravel()[block].astype(np.float64)
+    points = rigid3.transform(world_from_cam, in_cam)
+    normals = rigid3.rotate(
+        world_from_cam, all_normals.reshape(-1, 3)[block].astype(np.float64)
+    )
+    sight = points - world_from_cam[4:]
+    distance = np.linalg.norm(sight, axis=1)
+    sight /= distance[:, None]
+    slant = np.einsum("ni,ni->n", normals, sight)
+    weight = sensitivity**-2.0
+    moved, num_views = np.zeros(len(points)), np.ones(len(points), dtype=np.int64)
+    num_answers = np.ones(len(points), dtype=np.int64)
+    for other in others:
+        told = _told(other, points)
+        # A step along the other's sight moves the surface; along ours by this much.
+        turn = np.einsum("ni,ni->n", normals, told.sight) / slant
+        turn = np.clip(turn, 1.0 / 3.0, 3.0)
+        step, spread = told.difference * turn, told.sensitivity * turn
+        limit = AGREE_STDDEVS * noise * np.hypot(sensitivity, spread)
+        num_answers += np.isfinite(step)
+        with np.errstate(invalid="ignore"):
+            agrees = np.abs(step) <= limit
+        w = spread[agrees] ** -2.0
+        moved[agrees] += w * step[agrees]
+        weight[agrees] += w
+        num_views[agrees] += 1
+    points += (moved / weight)[:, None] * sight
+    confirmed = num_views >= min_views
+    keep = confirmed | (num_answers == 1) if keep_single else confirmed
+    kept = block[keep]
+    systematic = view.calibration.ravel()[kept]
+    fused = Fused(
+        points=points[keep],
+        normals=normals[keep],
+        colors=image.reshape(-1, 3)[kept][:, ::-1],
+        stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
+        num_views=num_views[keep],
+        view_range=distance[keep],
+    )
+    contradicted = ~confirmed & (num_answers > num_views)
+    counts = [confirmed, contradicted, ~confirmed & ~contradicted]
+    return fused, np.array([np.count_nonzero(mask) for mask in counts])
+
+
+def normals_of(view: Placed) -> NDArray[np.float32]:
+    """Normals (H, W, 3) in the camera, towards it; NaN at steps and borders."""
+    across, down = (_differences(view.points, axis) for axis in (1, 0))
+    normals = np.cross(across, down)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        slant = np.einsum("yxi,yxi->yx", normals, view.points) / view.distance
+        normals *= -np.sign(slant)[..., None]
+        normals[~(np.abs(slant) > _MAX_SLANT)] = np.nan
+    return normals
+
+
+def _differences(points: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """Between the points on both sides of a pixel, or of one side and itself."""
+    reach = _NORMAL_REACH
+    ahead, behind = np.full_like(points, np.nan), np.full_like(points, np.nan)
+    first, last = [slice(None)] * 2, [slice(None)] * 2
+    first[axis], last[axis] = slice(None, -reach), slice(reach, None)
+    step = points[tuple(last)] - points[tuple(first)]
+    ahead[tuple(first)], behind[tuple(last)] = step, step
+    both = ahead + behind
+    return np.where(
+        np.isfinite(both), both, np.where(np.isfinite(ahead), ahead, behind)
+    )
+
+
+def _told(other: Placed, points: Array) -> _Told:
+    in_cam = rigid3.transform(other.cam_from_world, points)
+    xy, valid = other.camera.img_from_point(in_cam)
+    distance = np.linalg.norm(in_cam, axis=1)
+    sensitivity = _looked_up(other.sensitivity, xy, nearest=True)
+    seen = _looked_up(other.distance, xy)
+    nearest = _looked_up(other.distance, xy, nearest=True)
+    with np.errstate(invalid="ignore"):
+        # Between two surfaces there is none.
+        seen[~(np.abs(seen - nearest) < sensitivity) | ~valid] = np.nan
+    world_from_cam = rigid3.inverse(other.cam_from_world)
+    sight = points - world_from_cam[4:]
+    sight /= distance[:, None]
+    return _Told(difference=seen - distance, sensitivity=sensitivity, sight=sight)
+
+
+def _looked_up(plane: Plane, xy: Array, nearest: bool = False) -> Array:
+    """Values (N,) at pixels (N, 2); NaN outside and beside NaN."""
+    # cv2.remap wants its positions as an image of limited width: fold them.
+    height = -(-len(xy) // FOLD)
+    at = np.full((height * FOLD, 2), -10.0, dtype=np.float32)
+    at[: len(xy)] = np.nan_to_num(xy - 0.5, nan=-10.0, posinf=-10.0, neginf=-10.0)
+    values = sampled(
+        plane, np.clip(at, -10.0, 1e6).reshape(height, FOLD, 2), nearest=nearest
+    )
+    return values.reshape(-1)[: len(xy)].astype(np.float64)
+
+
+def _empty() -> Fused:
+    return Fused(
+        points=np.empty((0, 3)),
+        normals=np.empty((0, 3)),
+        colors=np.empty((0, 3), dtype=np.uint8),
+        stddev=np.empty(0),
+        num_views=np.empty(0, dtype=np.int64),
+        view_range=np.empty(0),
+    )
+
+
+def placed(
+    camera: RefractiveCamera,
+    cam_from_world: Array,
+    ranges: Plane,
+    sensitivity: Plane,
+    calibration: Plane,
+) -> Placed:
+    """A depth map with its points."""
+    origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
+    points = origins + ranges.reshape(-1, 1) * dirs
+    shape = ranges.shape
+    return Placed(
+        camera=camera,
+        cam_from_world=cam_from_world,
+        points=points.astype(np.float32).reshape(*shape, 3),
+        distance=np.linalg.norm(points, axis=1).astype(np.float32).reshape(shape),
+        sensitivity=sensitivity,
+        calibration=calibration,
+    )

@@ -1,0 +1,204 @@
+"""Disparities of a rectified pair: semi-global matching, checked and refined.
+
+The semi-global matcher (OpenCV) finds the disparity to about a fifth of a pixel, and
+leans to whole pixels. From there a few Gauss-Newton steps compare the grey values in
+small windows, each normalised by its mean and contrast: every pixel of a window is
+compared at its own disparity, so that slanted surfaces match as well as those that
+face the camera. Nothing is invented: where the matcher has no disparity that is the
+same from left to right and back, there is none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# OpenCV's functions return arrays of any type, as far as type checkers know.
+Plane = NDArray[Any]
+"""(h, w) float32"""
+Gray = NDArray[Any]
+"""(h, w) uint8"""
+
+BLOCK = 5
+PREFILTER_CAP = 31
+UNIQUENESS_PERCENT = 5
+LEFT_RIGHT_PX = 1
+SPECKLE_PIXELS, SPECKLE_RANGE = 100, 2
+MULTIPLE = 16  # StereoSGBM wants the number of disparities so
+FRACTIONS = 16  # its results are integers in 1/16 px
+
+WINDOW_PX = 2.0
+"""Standard deviation of the windows that are compared, pixels."""
+NUM_STEPS = 3
+MAX_STEP_PX = 0.5
+MAX_CHANGE_PX = 1.0
+"""Farther from the matcher's result the refinement has gone astray."""
+MIN_CONTRAST = 1.0
+"""Grey levels; below it a window has only noise."""
+MIN_CORRELATION = 0.6
+"""Of the windows; below it they show different things."""
+MARGIN = 64
+"""Pixels around a tile whose costs are aggregated with it."""
+COST_BYTES = 6
+"""Of the matcher, per pixel and disparity (measured)."""
+
+
+def num_disparities(span: float) -> int:
+    """How many the matcher is given for a span of them."""
+    return max(MULTIPLE, int(np.ceil(span / MULTIPLE)) * MULTIPLE)
+
+
+def match_tiles(left: Gray, right: Gray, count: int, max_bytes: float) -> Plane:
+    """Semi-global disparities (h, w) from 0 to count - 1; NaN where there are none.
+
+    Args:
+        left, right: (h, w) rectified.
+        count: a multiple of 16.
+        max_bytes: of the matcher's costs; larger images are matched in tiles.
+    """
+    height, width = left.shape
+    rows, columns = height, width
+    if COST_BYTES * count * height * width > max_bytes:
+        # A tile needs the costs of what is around it, and on its left all that the
+        # disparities reach.
+        side = int(np.sqrt(max_bytes / (COST_BYTES * count)))
+        rows = max(side - 2 * MARGIN, MARGIN)
+        columns = max(side - 2 * MARGIN - count, MARGIN)
+    found = np.empty((height, width), dtype=np.float32)
+    for top in range(0, height, rows):
+        y = slice(max(top - MARGIN, 0), min(top + rows + MARGIN, height))
+        for start in range(0, width, columns):
+            x = slice(
+                max(start - MARGIN - count, 0), min(start + columns + MARGIN, width)
+            )
+            tile = _match(left[y, x], right[y, x], count)
+            found[top : top + rows, start : start + columns] = tile[
+                top - y.start : top - y.start + rows,
+                start - x.start : start - x.start + columns,
+            ]
+    return found
+
+
+def _match(left: Gray, right: Gray, count: int) -> Plane:
+    matcher = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=BLOCK,
+        P1=8 * BLOCK**2,
+        P2=32 * BLOCK**2,
+        disp12MaxDiff=LEFT_RIGHT_PX,
+        preFilterCap=PREFILTER_CAP,
+        uniquenessRatio=UNIQUENESS_PERCENT,
+        speckleWindowSize=SPECKLE_PIXELS,
+        speckleRange=SPECKLE_RANGE,
+        mode=cv2.STEREO_SGBM_MODE_HH,
+    )
+    fixed = matcher.compute(np.ascontiguousarray(left), np.ascontiguousarray(right))
+    disparity = fixed.astype(np.float32) / FRACTIONS
+    disparity[fixed < 0] = np.nan
+    return disparity
+
+
+def refine(left: Gray, right: Gray, start: Plane, rows: Plane) -> tuple[Plane, Plane]:
+    """Gauss-Newton from a matcher's disparities.
+
+    Args:
+        left, right: (h, w) rectified.
+        start: (h, w) disparities, NaN where there are none.
+        rows: (h, w) how far below the row of a pixel its match lies.
+
+    Returns:
+        Disparities (h, w), NaN where there are none or where the windows differ, and
+        the correlation (h, w) of the windows.
+    """
+    valid = np.isfinite(start)
+    mask = valid.astype(np.float32)
+    disparity = smoothed(start, valid)
+    seen = left.astype(np.float32)
+    mean, contrast = _contrast(seen, mask)
+    target = (seen - mean) / contrast
+    # cv2.Sobel's weights sum to eight pixels.
+    gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    source = right.astype(np.float32)
+    for _ in range(NUM_STEPS):
+        shown, slope = _warped((source, gradient), disparity, rows)
+        mean, contrast = _contrast(shown, mask)
+        slope *= mask / contrast
+        error = target - (shown - mean) / contrast
+        step = _blur(slope * error) / np.maximum(_blur(slope * slope), 1e-6)
+        step = np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)
+        disparity = smoothed(np.where(valid, disparity - step, np.nan), valid)
+    (shown,) = _warped((source,), disparity, rows)
+    correlation, contrast = _correlation(seen, shown, mask)
+    # At a step in depth the window holds two surfaces; the matcher knew better.
+    astray = ~(np.abs(disparity - start) < MAX_CHANGE_PX)
+    disparity = np.where(astray, start, disparity)
+    disparity[(correlation < MIN_CORRELATION) | (contrast < MIN_CONTRAST)] = np.nan
+    return disparity, correlation
+
+
+def _warped(planes: tuple[Plane, ...], disparity: Plane, rows: Plane) -> list[Plane]:
+    """Planes of the right image where the disparities point."""
+    height, width = disparity.shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    at_x = np.nan_to_num(x - disparity, nan=-1.0)
+    return [
+        cv2.remap(
+            plane, at_x, y + rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
+        for plane in planes
+    ]
+
+
+def _correlation(first: Plane, second: Plane, mask: Plane) -> tuple[Plane, Plane]:
+    """Of two planes in the windows, and the smaller contrast."""
+    share = np.maximum(_blur(mask), 1e-3)
+    means, contrasts = zip(*(_contrast(p, mask) for p in (first, second)), strict=True)
+    product = _blur(first * second * mask) / share - means[0] * means[1]
+    return product / (contrasts[0] * contrasts[1]), np.minimum(*contrasts)
+
+
+def _contrast(plane: Plane, mask: Plane) -> tuple[Plane, Plane]:
+    """Mean and standard deviation in the window."""
+    share = np.maximum(_blur(mask), 1e-3)
+    mean = _blur(plane * mask) / share
+    square = _blur(plane * plane * mask) / share
+    return mean, np.sqrt(np.maximum(square - mean * mean, 0.25))
+
+
+def _blur(plane: Plane) -> Plane:
+    return cv2.GaussianBlur(plane, (0, 0), WINDOW_PX, borderType=cv2.BORDER_REFLECT)
+
+
+def smoothed(disparity: Plane, valid: NDArray[np.bool_]) -> Plane:
+    """Local planes through the valid disparities: exact on slants, also at a border."""
+    height, width = disparity.shape
+    mask = valid.astype(np.float32)
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    d = np.where(valid, disparity, 0.0).astype(np.float32)
+    # Moments about each pixel: those about the origin lose digits far from it, so take
+    # them with kernels k, k x, k y, ... directly.
+    radius = int(np.ceil(3 * WINDOW_PX))
+    t = np.arange(-radius, radius + 1, dtype=np.float32)
+    k0 = np.exp(-0.5 * (t / WINDOW_PX) ** 2)
+    k0 /= k0.sum()
+    k1, k2 = k0 * t, k0 * t * t
+
+    def moment(plane: Plane, kx: Plane, ky: Plane) -> Plane:
+        return cv2.sepFilter2D(
+            plane, cv2.CV_32F, kx, ky, borderType=cv2.BORDER_CONSTANT
+        )
+
+    s, sx, sy = moment(mask, k0, k0), moment(mask, k1, k0), moment(mask, k0, k1)
+    sxx, sxy, syy = (moment(mask, k2, k0), moment(mask, k1, k1), moment(mask, k0, k2))
+    b, bx, by = moment(d, k0, k0), moment(d, k1, k0), moment(d, k0, k1)
+    sxx, syy = sxx + 1e-3, syy + 1e-3
+    # Cramer's rule for the value at the pixel itself.
+    c0, c1, c2 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
+    det = s * c0 + sx * c1 + sy * c2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = (b * c0 + bx * c1 + by * c2) / det
+    return np.where(valid & (det > 1e-6), value, disparity).astype(np.float32)

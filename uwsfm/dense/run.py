@@ -1,0 +1,410 @@
+"""`uwsfm dense`: a dense cloud from a result folder and its images."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from uwsfm._progress import Progress, silent
+from uwsfm.cloud import Cloud, write_cloud
+from uwsfm.dense.calibration_error import CalibrationError
+from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
+from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, placed, robust_stddev
+from uwsfm.dense.match import COST_BYTES, MULTIPLE
+from uwsfm.dense.options import ASSUMED_NOISE_PX, DenseOptions
+from uwsfm.dense.stereo import BYTES_PER_PIXEL, stereo_depth
+from uwsfm.dense.views import (
+    View,
+    cam_from_world,
+    load_image,
+    neighbours,
+    slabs_of,
+    stereo_views,
+)
+from uwsfm.dense.voxels import Fused, Voxels
+from uwsfm.errors import InputError, UwsfmError
+from uwsfm.export.files import WORK
+from uwsfm.export.summary import write_json
+from uwsfm.result_folder import Result, open_result
+from uwsfm.sfm.steps import fingerprint
+
+FOLDER, CLOUD, SUMMARY = "dense", "cloud.ply", "summary.json"
+FORMAT = 1
+PLACED_BYTES = 28
+"""Per pixel of a depth map in memory, with its points."""
+_NOISE_VIEWS, _NOISE_NEIGHBOURS = 24, 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DenseResult:
+    """What `dense_cloud` made; the same is on disk."""
+
+    cloud: Cloud
+    summary: dict[str, Any]
+    path: Path
+    """Of the cloud's file."""
+
+
+def dense_cloud(
+    out: str | Path,
+    images: str | Path | None = None,
+    *,
+    progress: Progress = silent,
+    **options: Any,
+) -> DenseResult:
+    """Make a dense cloud of a reconstruction.
+
+    Depth maps are kept in ``out/uwsfm-work/dense``: a run that was stopped goes on with
+    the first that is missing, and one with other options makes again what they change.
+
+    Args:
+        out: Folder of `reconstruct` or `refine_model`; receives ``dense/cloud.ply`` and
+            ``dense/summary.json``, each replaced as a whole.
+        images: The images' folder; default: where they were.
+        progress: Called with the step and what is done of it.
+        **options: Fields of `DenseOptions`.
+
+    Raises:
+        InputError: An option, the folder or an image is not usable.
+        UwsfmError: No depth could be found; the message says why.
+    """
+    settings = _parsed(options)
+    result = open_result(out, images)
+    with _Run(result, result.require_images(), settings, progress) as run:
+        return run.cloud()
+
+
+def _parsed(options: dict[str, Any]) -> DenseOptions:
+    unknown = sorted(set(options) - set(DenseOptions.__dataclass_fields__))
+    if unknown:
+        raise InputError(
+            f"unknown option {unknown[0]}: there are "
+            + ", ".join(DenseOptions.__dataclass_fields__)
+        )
+    return DenseOptions(**options)
+
+
+class _Run:
+    def __init__(
+        self, result: Result, images: Path, options: DenseOptions, progress: Progress
+    ) -> None:
+        self.result, self.images, self.options = result, images, options
+        self.model, self.progress = result.model, progress
+        self.views, self.refused = stereo_views(self.model)
+        self.work = result.folder / WORK / FOLDER
+        cores = os.cpu_count() or 1
+        self.threads = cores if options.num_threads < 1 else options.num_threads
+        self.errors: dict[tuple[int, int], CalibrationError | None] = {}
+        self.seconds: dict[str, float] = {}
+        self.store = _Store(self._placed, self._depth_budget())
+
+    def __enter__(self) -> _Run:
+        # OpenCV's own threads would fight with ours.
+        self._cv_threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        cv2.setNumThreads(self._cv_threads)
+
+    def cloud(self) -> DenseResult:
+        matched = self._timed("depth maps", self._match_all)
+        noise, assumed = self._timed("noise", self._noise)
+        voxel = self.options.voxel or self._footprint()
+        counts, cloud = self._timed("fusion", lambda: self._fuse_all(noise, voxel))
+        if not len(cloud):
+            raise UwsfmError(
+                f"no point is confirmed by {self.options.min_views} depth maps: the "
+                f"{len(self.views)} frames overlap too little; try --min-views 1"
+            )
+        folder = self.result.folder / FOLDER
+        unit = self.result.unit
+        write_cloud(cloud, folder / CLOUD, unit)
+        summary = {
+            "cloud": CLOUD,
+            "num_points": len(cloud),
+            "unit": unit,
+            "voxel": voxel,
+            "noise_px": noise,
+            "noise_from": "assumed" if assumed else "differences between depth maps",
+            "calibration_stddev_max": self._calibration_summary(),
+            "stddev_percentiles": _percentiles(cloud.stddev),
+            "range_percentiles": _percentiles(cloud.view_range),
+            "num_views_mean": float(np.mean(cloud.num_views)),
+            "depth_maps": matched,
+            "pairs_left_out": {
+                f"{a}-{b}": reason for (a, b), reason in self.refused.items()
+            },
+            **counts,
+            "options": asdict(self.options),
+            "seconds": self.seconds,
+        }
+        write_json(summary, folder / SUMMARY)
+        return DenseResult(cloud=cloud, summary=summary, path=folder / CLOUD)
+
+    def _timed(self, step: str, action: Callable[[], Any]) -> Any:
+        start = time.monotonic()
+        value = action()
+        self.seconds[step] = round(time.monotonic() - start, 3)
+        return value
+
+    # Depth maps.
+
+    def _match_all(self) -> list[dict[str, Any]]:
+        """Make every depth map that is not there; what is known of each."""
+        workers = max(1, min(self.threads, len(self.views)))
+        budget = self._budget_of(workers)
+        while workers > 1 and budget is None:
+            workers -= 1
+            budget = self._budget_of(workers)
+        if budget is None:
+            raise InputError(
+                f"--max-memory {self.options.max_memory / 1e9:.2f}GB is too little for "
+                f"images of this size: they need {self._needed() / 1e9:.2f}GB"
+            )
+        entries: list[dict[str, Any]] = [{} for _ in self.views]
+        self.progress("depth maps", 0, len(self.views))
+        with ThreadPoolExecutor(workers) as pool:
+            jobs = {
+                pool.submit(self._depth, index, budget): index
+                for index in range(len(self.views))
+            }
+            try:
+                for done, job in enumerate(as_completed(jobs), 1):
+                    entries[jobs[job]] = job.result()
+                    self.progress("depth maps", done, len(self.views))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return entries
+
+    def _depth(self, index: int, budget: float) -> dict[str, Any]:
+        view = self.views[index]
+        slabs = slabs_of(self.model, view)
+        path, key = self._path(view), self._key(view)
+        depth = read_depth_map(path, key)
+        if depth is None:
+            left, right = (
+                cv2.cvtColor(
+                    load_image(self.model, self.images, camera, name),
+                    cv2.COLOR_BGR2GRAY,
+                )
+                for camera, name in (
+                    (view.camera, view.name),
+                    (view.partner, view.partner_name),
+                )
+            )
+            depth = stereo_depth(slabs, left, right, budget).depth
+            write_depth_map(depth, path, key)
+        return {
+            "image": view.name,
+            "partner": view.partner_name,
+            "near": view.near,
+            "far": view.far,
+            "num_slabs": len(slabs),
+            "deviation_px": max(slab.deviation_px for slab in slabs),
+            "share_matched": depth.num_valid / depth.ranges.size,
+        }
+
+    def _path(self, view: View) -> Path:
+        name = f"{view.frame:06d}_{view.camera}-{view.partner}.npz"
+        return self.work / name
+
+    def _key(self, view: View) -> str:
+        """Of all that a depth map depends on."""
+        scene = self.model.scene
+        cameras = [
+            (scene.cameras[c].lens.tolist(), scene.cameras[c].port.row.tolist())
+            for c in view.key
+        ]
+        files = []
+        for name in (view.name, view.partner_name):
+            path = self.images / name
+            if not path.is_file():
+                raise InputError(
+                    f"image {path} is missing: say with --images where it is"
+                )
+            status = path.stat()
+            files.append((name, status.st_size, status.st_mtime_ns))
+        poses = scene.cam_from_rig[list(view.key)].tolist()
+        return fingerprint([FORMAT, cameras, files, poses, view.near, view.far])
+
+    # Memory.
+
+    def _depth_budget(self) -> float:
+        """Bytes for depth maps and voxels, beyond what the process has already."""
+        import psutil
+
+        return self.options.max_memory - psutil.Process().memory_info().rss
+
+    def _rectified_pixels(self) -> int:
+        return max(
+            slab.size[0] * slab.size[1]
+            for view in self.views
+            for slab in slabs_of(self.model, view)
+        )
+
+    def _needed(self) -> float:
+        """Bytes of one depth map with the smallest tiles."""
+        tile = (16 * MULTIPLE) ** 2 * COST_BYTES * 512
+        used = self.options.max_memory - self._depth_budget()
+        return used + BYTES_PER_PIXEL * self._rectified_pixels() + tile
+
+    def _budget_of(self, workers: int) -> float | None:
+        """Bytes for each worker; None if they are too few."""
+        used = self.options.max_memory - self._depth_budget()
+        each = (self.options.max_memory - used) / workers
+        return each if used + each >= self._needed() else None
+
+    # Fusion.
+
+    def _placed(self, index: int) -> Placed:
+        view = self.views[index]
+        depth = read_depth_map(self._path(view), self._key(view))
+        if depth is None:
+            raise UwsfmError(f"{self._path(view)} has changed while it was in use")
+        camera = self.model.scene.cameras[view.camera]
+        return placed(
+            camera,
+            cam_from_world(self.model, view),
+            depth.ranges,
+            depth.sensitivity,
+            self._calibration(view, depth),
+        )
+
+    def _calibration(self, view: View, depth: DepthMap) -> Any:
+        height, width = depth.ranges.shape
+        found = np.zeros((height, width), dtype=np.float32)
+        error = self.errors.get(view.key)
+        if error is None:
+            return found
+        rows = max(1, 200_000 // width)
+        camera = self.model.scene.cameras[view.camera]
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            values = error.stddev(
+                pixel_rows(camera, top, bottom), depth.ranges[top:bottom].ravel()
+            )
+            found[top:bottom] = values.reshape(bottom - top, width)
+        return np.nan_to_num(found)
+
+    def _prepare_errors(self) -> None:
+        covariance = self.result.calibration.covariance
+        for key in {view.key for view in self.views}:
+            of_key = [view for view in self.views if view.key == key]
+            self.errors[key] = None
+            if covariance.determined and len(covariance.border):
+                self.errors[key] = CalibrationError(
+                    self.model.scene,
+                    covariance,
+                    key,
+                    0.8 * min(view.near for view in of_key),
+                    1.5 * max(view.far for view in of_key),
+                )
+
+    def _calibration_summary(self) -> dict[str, float | None]:
+        return {
+            f"{a}-{b}": None if error is None else error.largest
+            for (a, b), error in self.errors.items()
+        }
+
+    def _noise(self) -> tuple[float, bool]:
+        """Standard deviation of a disparity, and whether it is only assumed."""
+        self._prepare_errors()
+        self.near = neighbours(self.model, self.views, self.options.max_neighbours)
+        if self.options.noise_px is not None:
+            return self.options.noise_px, True
+        samples = []
+        step = max(1, len(self.views) // _NOISE_VIEWS)
+        chosen = range(0, len(self.views), step)
+        for done, index in enumerate(chosen):
+            self.progress("noise", done, len(chosen))
+            others = [self.store.get(i) for i in self.near[index][:_NOISE_NEIGHBOURS]]
+            samples.append(noise_px(self.store.get(index), others))
+        self.progress("noise", len(chosen), len(chosen))
+        found = robust_stddev(np.concatenate(samples))
+        return (ASSUMED_NOISE_PX, True) if found is None else (found, False)
+
+    def _footprint(self) -> float:
+        """Of a pixel at the median distance."""
+        found = []
+        for index in range(0, len(self.views), max(1, len(self.views) // 8)):
+            points = self.store.get(index).points
+            across = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=-1)
+            if np.isfinite(across).any():
+                found.append(float(np.nanmedian(across)))
+        if not found:
+            raise UwsfmError("nothing was matched in any image: is the water clear?")
+        return float(np.median(found))
+
+    def _fuse_all(self, noise: float, voxel: float) -> tuple[dict[str, Any], Cloud]:
+        scene = self.model.scene
+        middle = np.nanmedian(scene.points, axis=0)
+        voxels = Voxels(voxel, middle, self._depth_budget() - self.store.max_bytes)
+        totals = np.zeros(4, dtype=np.int64)
+        count = len(self.views)
+        with ThreadPoolExecutor(self.threads) as pool:
+            # In order, so that runs repeat to the last digit; a few ahead, since what
+            # is finished waits in memory.
+            jobs: deque[Future] = deque()
+            for index in range(count + self.threads):
+                if index < count:
+                    jobs.append(pool.submit(self._fuse_one, index, noise))
+                if index < self.threads:
+                    continue
+                fused, counts = jobs.popleft().result()
+                voxels.add(fused)
+                totals += list(asdict(counts).values())
+                self.progress("fusion", index + 1 - self.threads, count)
+        names = ("num_measured", "num_confirmed", "num_contradicted", "num_unchecked")
+        return dict(zip(names, totals.tolist(), strict=True)), voxels.cloud()
+
+    def _fuse_one(self, index: int, noise: float) -> tuple[Fused, FuseCounts]:
+        view = self.views[index]
+        return fuse(
+            self.store.get(index),
+            [self.store.get(i) for i in self.near[index]],
+            load_image(self.model, self.images, view.camera, view.name),
+            noise,
+            min_views=self.options.min_views,
+            keep_single=self.options.keep_single,
+        )
+
+
+class _Store:
+    """Placed depth maps, the last used ones kept."""
+
+    def __init__(self, load: Callable[[int], Placed], budget: float) -> None:
+        self._load = load
+        self.max_bytes = 0.5 * budget
+        self._kept: OrderedDict[int, Placed] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, index: int) -> Placed:
+        with self._lock:
+            if index in self._kept:
+                self._kept.move_to_end(index)
+                return self._kept[index]
+        found = self._load(index)
+        with self._lock:
+            self._kept[index] = found
+            room = self.max_bytes / (PLACED_BYTES * found.distance.size)
+            while len(self._kept) > max(1, room):
+                self._kept.popitem(last=False)
+        return found
+
+
+def _percentiles(values: Any) -> dict[str, float]:
+    shares = (5, 50, 95)
+    found = np.nanpercentile(values, shares).tolist()
+    return dict(zip(map(str, shares), found, strict=True))

@@ -1,0 +1,173 @@
+"""Which images get a depth map, from which partner, and which others can check it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from uwsfm.colmap import Model
+from uwsfm.dense.rectify import Pair, Rectification, rectifications
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.sfm.images import read_color, size_fault
+
+MIN_POINTS = 10
+"""Of a frame, to know its depths from; with fewer those of all frames serve."""
+DEPTH_PERCENTILES = (1.0, 99.0)
+DEPTH_MARGIN = 0.15
+"""Of the inverse depths, on both sides: the scene goes on between its points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One depth map to make."""
+
+    camera: int
+    """The left one, whose pixels have depths."""
+    partner: int
+    frame: int
+    name: str
+    """Path of the image below the image folder."""
+    partner_name: str
+    near: float
+    """Depths along the axis of the camera, metres."""
+    far: float
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Camera and partner."""
+        return self.camera, self.partner
+
+
+def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
+    """Depth maps of all pairs of cameras that see enough together.
+
+    Returns:
+        The views, and why a pair of cameras was left out.
+
+    Raises:
+        InputError: no pair remains.
+    """
+    scene, rig = model.scene, model.rig
+    views: list[View] = []
+    refused: dict[tuple[int, int], str] = {}
+    depths = scene.points_in_cam()[:, 2]
+    for left in range(len(scene.cameras)):
+        for right in range(left + 1, len(scene.cameras)):
+            of_left = depths[scene.camera_idx == left]
+            if not np.isfinite(of_left).any():
+                refused[left, right] = "the first one sees no point"
+                continue
+            try:
+                rectifications(pair_of(model, left, right, *_limits(of_left)))
+            except InputError as error:
+                refused[left, right] = str(error)
+                continue
+            for frame in range(scene.num_frames):
+                if model.has_image(left, frame) and model.has_image(right, frame):
+                    rows = (scene.camera_idx == left) & (scene.frame_idx == frame)
+                    own = depths[rows & np.isfinite(depths)]
+                    near, far = _limits(own if len(own) >= MIN_POINTS else of_left)
+                    views.append(
+                        View(
+                            camera=left,
+                            partner=right,
+                            frame=frame,
+                            name=model.image_name(left, frame),
+                            partner_name=model.image_name(right, frame),
+                            near=near,
+                            far=far,
+                        )
+                    )
+    if not views:
+        reasons = "; ".join(
+            f"{rig.cameras[a].name} and {rig.cameras[b].name}: {reason}"
+            for (a, b), reason in refused.items()
+        )
+        raise InputError(
+            "no two cameras can be compared: "
+            + (reasons or "no frame has images of two cameras")
+        )
+    return views, refused
+
+
+def pair_of(model: Model, left: int, right: int, near: float, far: float) -> Pair:
+    """Two cameras of a rig."""
+    scene = model.scene
+    return Pair(
+        left=scene.cameras[left],
+        right=scene.cameras[right],
+        right_from_left=rigid3.compose(
+            scene.cam_from_rig[right], rigid3.inverse(scene.cam_from_rig[left])
+        ),
+        near=near,
+        far=far,
+    )
+
+
+def slabs_of(model: Model, view: View) -> tuple[Rectification, ...]:
+    """The rectified pairs of a view.
+
+    Raises:
+        InputError: the cameras share too little view at the depths of this frame.
+    """
+    return rectifications(
+        pair_of(model, view.camera, view.partner, view.near, view.far)
+    )
+
+
+def cam_from_world(model: Model, view: View) -> Array:
+    """Pose (7,) of a view."""
+    return rigid3.compose(
+        model.scene.cam_from_rig[view.camera], model.scene.rig_from_world[view.frame]
+    )
+
+
+def neighbours(model: Model, views: list[View], limit: int) -> list[list[int]]:
+    """For each view the indices of those that share most points with it."""
+    scene = model.scene
+    shape = scene.num_frames, scene.num_points
+    pairs = np.unique(np.stack([scene.frame_idx, scene.point_idx], axis=1), axis=0)
+    seen = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape).tocsr()
+    shared = (seen @ seen.T).tocsr()
+    of_frame: dict[int, list[int]] = {}
+    for index, view in enumerate(views):
+        of_frame.setdefault(view.frame, []).append(index)
+    found = []
+    for index, view in enumerate(views):
+        row = shared[[view.frame]].tocoo()
+        counts = dict(zip(row.coords[1].tolist(), row.data.tolist(), strict=True))
+        # Other pairs of the same frame come first: they see the same.
+        frames = sorted(counts, key=lambda f: (f != view.frame, -counts[f], f))
+        near = [i for f in frames for i in of_frame.get(f, []) if i != index]
+        found.append(near[:limit])
+    return found
+
+
+def load_image(model: Model, folder: Path, camera: int, name: str):
+    """An image (H, W, 3), blue, green, red.
+
+    Raises:
+        InputError: it is missing, damaged, or of another size than its camera's.
+    """
+    path = folder / name
+    if not path.is_file():
+        raise InputError(f"image {path} is missing: say with --images where it is")
+    image = read_color(path)
+    lens = model.scene.cameras[camera]
+    fault = size_fault(path, image, (lens.width, lens.height))
+    if fault is not None:
+        raise InputError(fault)
+    return image
+
+
+def _limits(depths: Array) -> tuple[float, float]:
+    """Nearest and farthest depth of a scene from those of its points."""
+    near, far = np.nanpercentile(depths, DEPTH_PERCENTILES)
+    margin = DEPTH_MARGIN * max(1.0 / near - 1.0 / far, 0.2 / near)
+    closest = 1.0 / near + margin
+    return 1.0 / closest, 1.0 / max(1.0 / far - margin, 0.3 / far)
