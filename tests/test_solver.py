@@ -201,7 +201,7 @@ def test_iteration_limit_is_told_and_every_step_reported():
         report=lambda iteration, cost: seen.append((iteration, cost)),
     )
     assert result.stop is lm.Stop.MAX_ITERATIONS and result.num_iterations == 2
-    assert [iteration for iteration, _ in seen] == [1, 2]
+    assert [iteration for iteration, _ in seen] == [0, 1, 2]
     assert seen[-1][1] == result.cost
 
 

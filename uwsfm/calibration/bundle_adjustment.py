@@ -51,7 +51,8 @@ def calibrate(
         scene: the start values, at least two frames.
         known: a scene with the values that priors are around; default: the start.
         lengths: scale bars, distances between frames, positions.
-        report: called after every step with (iteration, cost).
+        report: called with (0, cost) at the start of every solve, and with
+            (iteration, cost) after every step.
         **options: fields of `CalibrateOptions`.
 
     Raises:
@@ -158,6 +159,7 @@ def _summary(run: Run, solved: Solved, seconds: float) -> CalibrateSummary:
         num_outliers=scene.num_observations - int(np.count_nonzero(solved.inliers)),
         num_invalid=solved.result.num_invalid,
         num_iterations=run.num_iterations,
+        solves=tuple(run.solves),
         converged=solved.result.stop is Stop.CONVERGED,
         initial_rms_px=float(np.sqrt(np.nanmean(before))),
         rms_px=float(np.sqrt(np.mean(squares))),

@@ -293,6 +293,18 @@ class Covariance:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SolveHistory:
+    """How the cost of one solve fell."""
+
+    error: str
+    loss: str
+    num_observations: int
+    costs: tuple[float, ...]
+    """0.5 sum rho, priors included, px^2 (of an error in space: m^2): of the start
+    and after each step; of the nested strategy, after each pass."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CalibrateSummary:
     """What happened. Errors are true reprojection errors in pixels."""
 
@@ -305,6 +317,8 @@ class CalibrateSummary:
     num_invalid: int
     """That could not be projected at the optimum; never counted as a fit."""
     num_iterations: int
+    solves: tuple[SolveHistory, ...]
+    """In their order: robust ones come before least squares on what they left."""
     converged: bool
     initial_rms_px: float
     """Of all observations that could be projected at the start."""

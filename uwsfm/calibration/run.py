@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
-from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.problem import CalibrateOptions, SolveHistory
 from uwsfm.calibration.strategies import STRATEGIES
 from uwsfm.calibration.uncertainty import Optimum, scale_stddev
 from uwsfm.errors import InputError, UwsfmError
@@ -112,6 +112,7 @@ class Run:
         self.report = report
         self.at_zero = np.zeros(len(scene.cameras), dtype=bool)
         self.num_iterations = 0
+        self.solves: list[SolveHistory] = []
 
     @property
     def columns(self) -> IndexArray:
@@ -162,9 +163,22 @@ class Run:
         )
         priors = self.priors(used, np.unique(part.frame_idx), sigma_px)
         part_state = replace(start, points=start.points[used])
-        strategy = STRATEGIES[self.settings.strategy]
-        result = strategy(layout, part_state, options, priors, self.report)
+        strategy, costs = STRATEGIES[self.settings.strategy], []
+
+        def noted(iteration: int, cost: float) -> None:
+            costs.append(cost)
+            if self.report is not None:
+                self.report(iteration, cost)
+
+        result = strategy(layout, part_state, options, priors, noted)
         self.num_iterations += result.num_iterations
+        history = SolveHistory(
+            error=options.error,
+            loss=loss,
+            num_observations=len(layout.xy),
+            costs=tuple(costs),
+        )
+        self.solves.append(history)
         points = np.full_like(self.scene.points, np.nan)
         points[used] = result.state.points
         return Solved(

@@ -33,6 +33,7 @@ from uwsfm.calibration.problem import (
     CalibrationResult,
     CameraCovariance,
     Covariance,
+    SolveHistory,
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
@@ -185,13 +186,20 @@ def _calibration(
     return CalibrationResult(
         scene=scene,
         inliers=np.ones(scene.num_observations, dtype=bool),
-        summary=CalibrateSummary(**about["summary"]),
+        summary=_summary(about["summary"]),
         covariance=covariance,
         options=CalibrateOptions.parsed(options),
         lengths=_read("lengths.", LengthFit, arrays),
         positions=_read("positions.", PositionFit, arrays),
         entered=_entered(arrays),
         bars=_bars(arrays, scene),
+    )
+
+
+def _summary(about: dict[str, Any]) -> CalibrateSummary:
+    solves = [{**solve, "costs": tuple(solve["costs"])} for solve in about["solves"]]
+    return CalibrateSummary(
+        **{**about, "solves": tuple(SolveHistory(**solve) for solve in solves)}
     )
 
 

@@ -5,6 +5,7 @@ import json
 import math
 import platform
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,7 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
         "sigma_px": summary.sigma_px,
         "solver_iterations": summary.num_iterations,
         "solver_converged": summary.converged,
+        "solves": [asdict(solve) for solve in summary.solves],
         "housing_determined": calibration.covariance.determined,
         "scale": scale_summary(calibration),
     }

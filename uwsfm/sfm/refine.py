@@ -115,6 +115,8 @@ def refine_scene(
     kept = np.nonzero(keep)[0][found]
     final, still = second.scene.select(found)
     before = start.residuals()[kept]
+    solves = first.summary.solves + second.summary.solves
+    second = replace(second, summary=replace(second.summary, solves=solves))
     return Refined(
         scene=final,
         kept=kept,

@@ -260,6 +260,8 @@ def _iterate(
             "cam_from_rig and of the poses"
         )
     damping, growth = options.initial_damping, 2.0
+    if report is not None:
+        report(0, cost)
     # Below this all residuals are rounding errors (about 1e-11 px each).
     floor = 1e-22 * len(problem.layout.xy)
     eqs = problem.linearize(state)
