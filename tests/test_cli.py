@@ -28,6 +28,8 @@ COMMANDS = [
     ["clean"],
     ["export"],
     ["map"],
+    ["report"],
+    ["view"],
     ["simulate"],
     ["simulate", "images"],
     ["simulate", "observations"],
@@ -62,6 +64,10 @@ def test_help_and_version_import_nothing_heavy():
         "open3d",
         "yaml",
         "distributed",
+        "matplotlib",
+        "plotly",
+        "jinja2",
+        "rerun",
     )
     code = (
         "import sys; sys.argv = ['uwsfm', '--version']\n"

@@ -20,6 +20,7 @@ from test_three_cameras import three_camera_rig
 import uwsfm
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3, unit_vector
+from uwsfm.output_folder import RESULTS, WORK
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
@@ -73,8 +74,8 @@ def test_self_calibrated_models_end_at_the_refractive_optimum(
     np.testing.assert_allclose(  # COLMAP normalises quaternions: rounding only
         model.errors_px(), result.model.errors_px(), atol=1e-8
     )
-    names = {"sparse", "housing.yaml", "points.ply", "summary.json", "uwsfm-work"}
-    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {*RESULTS, WORK}
     assert np.all(model.colors == [10, 20, 30])  # those of the model
     assert np.linalg.norm(model.scene.cam_from_rig[1, 4:]) == pytest.approx(0.2)
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from uwsfm.models.status import Status
     from uwsfm.pipeline import reconstruct
     from uwsfm.refine_pipeline import refine_model
+    from uwsfm.report.files import write_report
     from uwsfm.result_folder import Result, open_result
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
@@ -88,6 +89,7 @@ _HOMES = {
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
+    "write_report": "uwsfm.report.files",
     "write_cloud": "uwsfm.cloud",
 }
 
@@ -131,6 +133,7 @@ __all__ = [
     "rig_of_refractive_colmap",
     "run_batch",
     "verdicts",
+    "write_report",
     "write_cloud",
 ]
 

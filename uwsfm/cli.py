@@ -29,6 +29,7 @@ from uwsfm.cli_options import (
 )
 from uwsfm.cli_simulate import simulate_app
 from uwsfm.cli_surface import clean, map_
+from uwsfm.cli_view import report, view
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ app.command()(batch)
 app.command()(dense)
 app.command()(clean)
 app.command("map")(map_)
+app.command()(report)
+app.command()(view)
 
 FAILED, WRONG_INPUT = 1, 2
 
@@ -318,7 +321,7 @@ def demo(
         result, comparison = run_demo(out, mapper, progress)
     _print_result(result.summary)
     console.print(comparison_table(comparison))
-    typer.echo(f"results in {out}: open points.ply in MeshLab, sparse/ in COLMAP")
+    typer.echo(f"results in {out}: open report.html, or points.ply in MeshLab")
 
 
 def _print_result(summary: dict) -> None:

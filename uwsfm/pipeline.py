@@ -1,15 +1,12 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
-import json
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
@@ -17,13 +14,10 @@ from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
-from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
     SPARSE,
-    SUMMARY,
-    WORK,
     export_colmap,
     export_ply,
 )
@@ -35,10 +29,12 @@ from uwsfm.export.summary import (
     refined_summary,
     scale_summary,
     versions,
-    write_json,
 )
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
+from uwsfm.output_folder import WORK, locked, output_folder
+from uwsfm.report.command import command_line
+from uwsfm.report.files import write_with_report
 from uwsfm.result_folder import recorded_images, store_calibration
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
@@ -57,11 +53,8 @@ from uwsfm.sfm.options import (
 from uwsfm.sfm.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
-from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
-
-LOCK = "lock"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,6 +127,7 @@ def reconstruct(
         InputError: An option, the rig file, images or output folder are not usable.
         UwsfmError: The images could not be reconstructed; the message says why.
     """
+    command = command_line("reconstruct", reconstruct, locals())
     rig = checked_rig(rig)
     require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
     out = output_folder(out)
@@ -156,7 +150,9 @@ def reconstruct(
     with Workers(scheduler):  # whether a scheduler answers, and has a worker
         pass
     with locked(out):
-        job = _Job(rig, Path(images), out, options, known, calibration, progress)
+        job = _Job(
+            rig, Path(images), out, options, known, calibration, command, progress
+        )
         return job.run()
 
 
@@ -170,6 +166,7 @@ class _Job:
     options: StartOptions
     known: KnownLengths
     calibration: Mapping[str, Any]
+    command: str | None
     progress: Progress
 
     def run(self) -> ReconstructResult:
@@ -191,7 +188,8 @@ class _Job:
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
-        write_json(summary, out / SUMMARY)
+        summary["command"] = self.command
+        write_with_report(out, model, refined.calibration, summary, self.progress)
         return ReconstructResult(
             model=model,
             calibration=refined.calibration,
@@ -236,49 +234,6 @@ def checked_rig(rig: Rig | str | Path) -> Rig:
         except InputError as error:
             raise InputError(f"camera {camera.name!r}: {error}") from None
     return rig
-
-
-def output_folder(out: str | Path) -> Path:
-    """Refuse what would overwrite files that are not ours."""
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file, not a folder for results")
-    if _made_by_us(out):
-        return out
-    for name in (SPARSE, HOUSING, POINTS, CALIBRATION, SUMMARY, WORK):
-        if (out / name).exists():
-            raise InputError(
-                f"{out / name} exists and was not made by uwsfm: choose another folder"
-            )
-    return out
-
-
-def _made_by_us(out: Path) -> bool:
-    """Whether an earlier run, finished or not, left its marks in a folder."""
-    if (out / WORK / STEPS_FILE).exists() or (out / WORK / LOCK).exists():
-        return True
-    try:
-        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
-        return "uwsfm" in summary["versions"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-
-
-@contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Keep a second run out of the folder: both would write the same database."""
-    try:
-        (out / WORK).mkdir(parents=True, exist_ok=True)
-        lock = FileLock(out / WORK / LOCK)
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise InputError(f"another uwsfm is at work in {out}") from None
-    except OSError as error:
-        raise InputError(f"cannot write to {out}: {error.strerror}") from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:

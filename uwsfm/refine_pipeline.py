@@ -17,7 +17,6 @@ from uwsfm.export.files import (
     HOUSING,
     POINTS,
     SPARSE,
-    SUMMARY,
     export_colmap,
 )
 from uwsfm.export.housing import export_housing
@@ -27,7 +26,6 @@ from uwsfm.export.summary import (
     outside_summary,
     refined_summary,
     versions,
-    write_json,
 )
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
@@ -41,6 +39,8 @@ from uwsfm.pipeline import (
     refined_rig,
     require_effect,
 )
+from uwsfm.report.command import command_line
+from uwsfm.report.files import write_with_report
 from uwsfm.result_folder import recorded_images, store_calibration
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
@@ -126,6 +126,7 @@ def refine_model(
             the rig contradicts the model; the message says what to change.
         UwsfmError: too little of the model agrees with the refractive one.
     """
+    command = command_line("refine", refine_model, locals())
     rig = checked_rig(rig)
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
@@ -151,7 +152,7 @@ def refine_model(
     known.check_names(rig, names)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out):
-        job = _Job(rig, start, matches, known, images, out, progress, timings)
+        job = _Job(rig, start, matches, known, images, out, command, progress, timings)
         return job.run(options)
 
 
@@ -200,6 +201,7 @@ class _Job:
     lengths: KnownLengths
     images: Path | None
     out: Path
+    command: str | None
     progress: Progress
     timings: dict[str, float]
 
@@ -226,7 +228,9 @@ class _Job:
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
-        write_json(summary, self.out / SUMMARY)
+        summary["command"] = self.command
+        calibration = refined.calibration
+        write_with_report(self.out, model, calibration, summary, self.progress)
         return RefineResult(
             model=model,
             calibration=refined.calibration,

@@ -1,0 +1,191 @@
+"""report.html: what it says, that it is complete, and that it never costs a result."""
+
+import base64
+import json
+import re
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import typer
+
+import uwsfm
+from uwsfm import InputError
+from uwsfm.cli import app
+from uwsfm.geometry import rigid3
+from uwsfm.pipeline import reconstruct
+from uwsfm.report.command import command_line
+from uwsfm.report.files import FOLDER, NUMBERS, PAGE, write_with_report
+from uwsfm.report.tables import frame_stddevs
+from uwsfm.report.view import MAX_POINTS, view_of
+from uwsfm.report.words import deviation, rounded, verdict_of
+
+
+def payload_of(page: str) -> dict:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    return json.loads(found.group(1))
+
+
+def test_refine_writes_a_page_that_says_what_the_summary_says(dive_result):
+    page = (dive_result.out / PAGE).read_text(encoding="utf-8")
+    summary = dive_result.result.summary
+    assert "report" in summary["timings_s"]
+    verdict = verdict_of(summary)
+    assert summary["scale"]["verdict"] == verdict.metric_word == "determined"
+    assert "known lengths" in verdict.metric and verdict.metric in page
+    for port in verdict.ports:
+        assert port.text in page
+    for camera in summary["cameras"]:
+        assert f"tilt {camera['normal_verdict']}" in page
+        assert f"distance {camera['distance_verdict']}" in page
+    # Nothing is fetched: all that the page refers to lies beside it.
+    own = page[: page.index("<script>")]
+    places = re.findall(r'(?:href|src)="([^"]*)"', own)
+    assert {p for p in places if not p.startswith(("#", "data:"))} == {
+        "report/report.json",
+        "summary.json",
+    }
+    cloud = base64.b64decode(payload_of(page)["view"]["points"])
+    points = np.frombuffer(cloud, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(
+        points, dive_result.result.model.scene.points, rtol=0, atol=1e-6
+    )
+
+
+def test_the_numbers_and_pictures_are_beside_it(dive_result):
+    folder = dive_result.out / FOLDER
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        NUMBERS,
+        "residuals_0.png",
+        "residuals_1.png",
+        "coverage.png",
+        "convergence.png",
+        "cloud.png",
+    }
+    numbers = json.loads((folder / NUMBERS).read_text())
+    costs = [solve["costs"] for solve in numbers["convergence"]]
+    summary = dive_result.result.summary
+    last = numbers["convergence"][-1]
+    # 0.5 sum of squares; the clicks on the scale bar, of 1 px, and priors are in it.
+    rms = np.sqrt(2.0 * last["costs"][-1] / last["num_observations"])
+    after = summary["reprojection_rms_px"]["after"]
+    assert last["loss"] == "l2" and after <= rms < 1.1 * after
+    assert all(solve[0] >= solve[-1] for solve in costs)
+    frame = numbers["frames"][0]
+    assert frame["position_stddev_m"] == 0.0 and frame["num_images"] == 2
+
+
+def test_a_report_that_fails_costs_no_result(dive_result, tmp_path):
+    result = dive_result.result
+    mine = tmp_path / FOLDER / "thesis.txt"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    (tmp_path / PAGE).write_text("of an earlier run")
+    summary = json.loads(json.dumps(result.summary))
+    write_with_report(tmp_path, result.model, result.calibration, summary)
+    assert mine.read_text() == "mine" and not (tmp_path / PAGE).exists()
+    written = json.loads((tmp_path / "summary.json").read_text())
+    assert written == summary
+    assert written["warnings"][-1].startswith("the report could not be written: ")
+    assert str(mine.parent) in written["warnings"][-1]
+
+
+def test_report_of_what_is_no_result_is_refused(tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        uwsfm.write_report(tmp_path / "nowhere")
+
+
+def test_the_command_is_one_that_the_program_takes(tmp_path):
+    asked = {
+        "rig": tmp_path / "my rig.yaml",
+        "images": "images",
+        "out": "out",
+        "clahe": True,
+        "masks": None,
+        "matching": "sequential",
+        "matcher": "colmap",
+        "mapper": "refractive",
+        "positions": "nav.csv",
+        "lever_arm": (-0.2, 0.0, 1.5),
+        "lengths": None,
+        "scene_distance_m": 2.5,
+        "seed": 3,
+        "num_threads": -1,
+        "submap_frames": None,
+        "scheduler": "local",
+        "progress": print,
+        "calibration": {"refine_water_index": True, "water_index_stddev": 0.002},
+    }
+    text = command_line("reconstruct", reconstruct, asked)
+    program, command, *words = shlex.split(text)
+    assert program == "uwsfm"
+    parsed = typer.main.get_command(app).commands[command].make_context(command, words)
+    found = parsed.params
+    assert found["rig"] == asked["rig"] and found["clahe"] is True
+    assert found["matching"] == "sequential" and found["seed"] == 3
+    assert found["lever_arm"] == "-0.2,0,1.5" and found["scene_distance"] == 2.5
+    assert [item.value for item in found["also"]] == ["water-index"]
+    assert found["prior"] == ["water_index_stddev=0.002"]
+    in_python = {**asked, "calibration": {"max_iterations": 3}}
+    assert command_line("reconstruct", reconstruct, in_python) is None
+
+
+def test_digits_follow_the_standard_deviation():
+    assert rounded(0.0199284, 0.000103, 1e3) == "19.93"
+    assert deviation(0.000103, 1e3) == "0.10"
+    assert deviation(None) == "-" and rounded(1.5, None) == "1.5"
+    assert rounded(1234.5678, 25.0) == "1235" and deviation(25.0) == "25"
+
+
+def test_stddevs_of_the_frames_are_those_of_their_centres(dive_result, rng):
+    covariance = dive_result.result.calibration.covariance
+    pose = dive_result.result.model.scene.rig_from_world[-1]
+    turns, places = frame_stddevs(covariance)
+    steps = rng.multivariate_normal(np.zeros(6), covariance.frames[-1], 20_000)
+    moved = rigid3.perturb(pose, steps)
+    centers = rigid3.inverse(moved)[:, 4:]
+    spread = np.sqrt(np.var(centers, axis=0).sum())
+    angle = rigid3.rotation_angle(rigid3.compose(moved, rigid3.inverse(pose)))
+    # 20000 draws know a spread to 0.5 % per axis.
+    np.testing.assert_allclose(places[-1], spread, rtol=0.02)
+    np.testing.assert_allclose(
+        turns[-1], np.degrees(np.sqrt(np.mean(angle**2))), rtol=0.02
+    )
+
+
+def test_a_large_cloud_is_thinned_and_far_points_left_out(dive_result):
+    model = dive_result.result.model
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (MAX_POINTS + 50, 3))
+    points[:20] = 1e4
+    points[20:25] = np.nan  # too few observations
+    scene = replace(model.scene, points=points)
+    colors = np.zeros((len(points), 3), dtype=np.uint8)
+    covariance = dive_result.result.calibration.covariance
+    covariances = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    with np.errstate(invalid="ignore"):  # most have no line of sight
+        view = view_of(
+            replace(model, scene=scene, colors=colors),
+            replace(covariance, points=covariances),
+        )
+    assert len(view.points) == MAX_POINTS and view.num_all_points == len(points)
+    assert view.num_outlying == 20 and np.abs(view.points).max() <= 1.0
+
+
+def test_far_worlds_keep_their_digits(dive_result):
+    model = dive_result.result.model
+    away = np.array([5e5, 6.2e6, -10.0])
+    scene = model.scene
+    shift = rigid3.from_rotmat(np.eye(3), -away)
+    moved = replace(
+        scene,
+        points=scene.points + away,
+        rig_from_world=rigid3.compose(scene.rig_from_world, shift),
+    )
+    covariance = dive_result.result.calibration.covariance
+    here, there = (view_of(replace(model, scene=s), covariance) for s in (scene, moved))
+    assert not np.any(here.origin)
+    as_drawn = there.points.astype(np.float32) + (there.origin - away)
+    # Half a unit in the last place of 32 bits, for coordinates of a few metres.
+    np.testing.assert_allclose(as_drawn, here.points, atol=1e-6)

@@ -1,0 +1,61 @@
+"""The output folder of a run: never over what others made, one run at a time."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import CALIBRATION
+from uwsfm.export.files import HOUSING, POINTS, SPARSE, SUMMARY, WORK
+from uwsfm.report.files import FOLDER, PAGE
+from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
+
+LOCK = "lock"
+RESULTS = (SPARSE, HOUSING, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
+"""What a run writes."""
+
+
+def output_folder(out: str | Path) -> Path:
+    """Refuse what would overwrite files that are not ours."""
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file, not a folder for results")
+    if _made_by_us(out):
+        return out
+    for name in (*RESULTS, WORK):
+        if (out / name).exists():
+            raise InputError(
+                f"{out / name} exists and was not made by uwsfm: choose another folder"
+            )
+    return out
+
+
+def _made_by_us(out: Path) -> bool:
+    """Whether an earlier run, finished or not, left its marks in a folder."""
+    if (out / WORK / STEPS_FILE).exists() or (out / WORK / LOCK).exists():
+        return True
+    try:
+        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+        return "uwsfm" in summary["versions"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep a second run out of the folder: both would write the same database."""
+    try:
+        (out / WORK).mkdir(parents=True, exist_ok=True)
+        lock = FileLock(out / WORK / LOCK)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(f"another uwsfm is at work in {out}") from None
+    except OSError as error:
+        raise InputError(f"cannot write to {out}: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        lock.release()

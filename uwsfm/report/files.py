@@ -1,0 +1,100 @@
+"""report.html and the folder report/, as files of an output folder."""
+
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from uwsfm._files import replaced_dir, replaced_file
+from uwsfm._progress import Progress, silent
+from uwsfm.calibration.problem import CalibrationResult, Covariance
+from uwsfm.colmap import Model
+from uwsfm.errors import InputError
+from uwsfm.export.files import SUMMARY
+from uwsfm.export.summary import write_json
+from uwsfm.report.gather import gather, numbers_of
+from uwsfm.result_folder import open_result
+
+PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"
+
+
+def write_report(out: str | Path) -> Path:
+    """Write the report of an output folder again.
+
+    Args:
+        out: Folder that `reconstruct`, `refine_model` or `run_demo` wrote.
+
+    Returns:
+        The page, ``out/report.html``.
+
+    Raises:
+        InputError: the folder is not such a one, or cannot be written to.
+    """
+    result = open_result(out)
+    covariance = result.calibration.covariance
+    return write_files(result.folder, result.model, covariance, result.summary)
+
+
+def write_with_report(
+    out: Path,
+    model: Model,
+    calibration: CalibrationResult,
+    summary: dict[str, Any],
+    progress: Progress = silent,
+) -> None:
+    """Write summary.json and then the report, which may fail without losing a result.
+
+    Args:
+        out: The output folder; all else is there already.
+        model: The result.
+        calibration: Of its scene.
+        summary: Gets the time that the report took, and a warning if it failed.
+        progress: Called with the step "report".
+    """
+    write_json(summary, out / SUMMARY)
+    progress("report", 0, None)
+    clock = time.perf_counter()
+    try:
+        write_files(out, model, calibration.covariance, summary)
+    except Exception as error:  # whatever it is, the result is worth more
+        with suppress(OSError):
+            (out / PAGE).unlink(missing_ok=True)  # it would be that of an earlier run
+        why = f"{error}" if isinstance(error, InputError) else repr(error)
+        summary["warnings"].append(f"the report could not be written: {why}")
+    summary["timings_s"]["report"] = time.perf_counter() - clock
+    write_json(summary, out / SUMMARY)
+
+
+def write_files(
+    out: str | Path, model: Model, covariance: Covariance, summary: dict[str, Any]
+) -> Path:
+    """Write ``report.html`` and ``report/`` of a result; each replaced as a whole.
+
+    Args:
+        out: The output folder.
+        model: The result.
+        covariance: Of its scene.
+        summary: What its summary.json holds.
+
+    Returns:
+        The page.
+
+    Raises:
+        InputError: the place is taken by what uwsfm did not write, or cannot be
+            written to.
+    """
+    from uwsfm.report.page import page_of
+    from uwsfm.report.pictures import draw_pictures
+
+    out = Path(out)
+    folder, page = out / FOLDER, out / PAGE
+    if folder.exists() and not (folder / NUMBERS).is_file():
+        raise InputError(f"{folder} exists and was not made by uwsfm: move it away")
+    report = gather(model, covariance, summary, out)
+    with replaced_dir(folder) as partial:
+        write_json(numbers_of(report), partial / NUMBERS)
+        draw_pictures(report, partial)
+    text = page_of(report)
+    with replaced_file(page) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return page

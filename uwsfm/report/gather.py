@@ -1,0 +1,136 @@
+"""All numbers of a report, as plain data."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwsfm.calibration.problem import Covariance
+from uwsfm.colmap import Model
+from uwsfm.report.residuals import FEWEST, CameraResiduals, camera_residuals
+from uwsfm.report.tables import Estimate, Frame, estimates, frames
+from uwsfm.report.view import View, view_of
+from uwsfm.report.words import Verdict, small_unit_of, unit_of, verdict_of
+
+OTHER_FILES = (
+    ("dense.ply", "dense cloud"),
+    ("mesh.ply", "mesh"),
+    ("mesh.glb", "mesh for the web"),
+    ("orthophoto.tif", "orthophoto"),
+    ("height.tif", "height map"),
+    ("measurements.json", "measurements"),
+)
+"""What other commands may have left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """Where in its images a camera has features and observations."""
+
+    name: str
+    num_images: int
+    features_per_image: float
+    """Median."""
+    observations_per_image: float
+    """Median; of points of the result."""
+    empty_share: float
+    """Of the image's area without `FEWEST` observations in all images together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What the page and the pictures show."""
+
+    title: str
+    unit: str
+    """Of lengths: "m" or "units"."""
+    small_unit: str
+    """Of lengths times 1000."""
+    verdict: Verdict
+    estimates: tuple[Estimate, ...]
+    view: View
+    residuals: tuple[CameraResiduals, ...]
+    coverage: tuple[Coverage, ...]
+    frames: tuple[Frame, ...]
+    summary: dict[str, Any]
+    other_files: tuple[tuple[str, str], ...]
+    """Path in the output folder, and what it is."""
+
+
+def gather(
+    model: Model, covariance: Covariance, summary: dict[str, Any], out: Path
+) -> Report:
+    """Measure everything that a report shows.
+
+    Args:
+        model: The result.
+        covariance: Of its scene.
+        summary: What summary.json holds.
+        out: The output folder.
+    """
+    names = [camera.name for camera in model.rig.cameras]
+    residuals = tuple(camera_residuals(model.scene, names))
+    return Report(
+        title=out.resolve().name,
+        unit=unit_of(summary),
+        small_unit=small_unit_of(summary),
+        verdict=verdict_of(summary),
+        estimates=estimates(summary),
+        view=view_of(model, covariance),
+        residuals=residuals,
+        coverage=tuple(_coverage(model, names.index(r.name), r) for r in residuals),
+        frames=frames(model, covariance),
+        summary=summary,
+        other_files=tuple(
+            (path, what) for path, what in OTHER_FILES if (out / path).is_file()
+        ),
+    )
+
+
+def _coverage(model: Model, camera: int, found: CameraResiduals) -> Coverage:
+    scene = model.scene
+    mine = scene.frame_idx[scene.camera_idx == camera]
+    seen = np.bincount(mine, minlength=scene.num_frames)
+    there = [model.has_image(camera, frame) for frame in range(scene.num_frames)]
+    features = [len(points) for points in model.keypoints[camera] if len(points)]
+    return Coverage(
+        name=found.name,
+        num_images=int(np.count_nonzero(there)),
+        features_per_image=float(np.median(features)),
+        observations_per_image=float(np.median(seen[there])),
+        empty_share=float(np.mean(found.counts < FEWEST)),
+    )
+
+
+def numbers_of(report: Report) -> dict[str, Any]:
+    """What report.json holds: everything but the cloud itself."""
+    fields = {
+        name: plain(getattr(report, name))
+        for name in ("title", "unit", "verdict", "estimates", "residuals")
+    }
+    return {
+        **fields,
+        "coverage": plain(report.coverage),
+        "frames": plain(report.frames),
+        "convergence": report.summary["solves"],
+        "timings_s": report.summary["timings_s"],
+        "versions": report.summary["versions"],
+        "command": report.summary.get("command"),
+    }
+
+
+def plain(value: Any) -> Any:
+    """Data as JSON has them: NaN becomes null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return {field.name: plain(getattr(value, field.name)) for field in fields}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,257 @@
+"""The page: the template, filled with the numbers of a report."""
+
+import base64
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uwsfm.report.gather import Report, plain
+from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.report.view import View
+from uwsfm.report.words import deviation
+
+_BADGES = {
+    "determined": "good",
+    "weakly determined": "weak",
+    "not determined": "bad",
+    "arbitrary": "bad",
+    "ran into zero": "bad",
+}
+_SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
+"""A shape beside the word: colour alone tells nothing to many."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Of the plots of one camera, the same before and after."""
+
+    map_px: float
+    """Darkest colour of the maps."""
+    factor: int
+    """Lines of the maps are so many times as long as what they stand for."""
+    profile_px: float
+
+
+def page_of(report: Report) -> str:
+    """The page as HTML, everything it needs in it."""
+    from jinja2 import Environment, StrictUndefined  # heavy, so the next
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    assets = files("uwsfm.report") / "templates"
+
+    def asset(name: str) -> str:
+        return (assets / name).read_text(encoding="utf-8")
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.globals["badge"] = lambda word, what="": Markup(_badge(word, what))
+    template = environment.from_string(asset("report.html.j2"))
+    scales = [scales_of(camera) for camera in report.residuals]
+    summary = report.summary
+    return template.render(
+        report=report,
+        summary=summary,
+        written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        water_given=not any("water index" in row["name"] for row in summary["refined"]),
+        view_caption=_view_caption(report),
+        residual_words=[_residual_words(camera, report) for camera in report.residuals],
+        pinhole_models=_pinhole_models(report),
+        scales=scales,
+        fewest=FEWEST,
+        cost_unit=cost_unit(summary),
+        last_solve=f"{summary['solves'][-1]['num_observations']} observations",
+        frame_rows=_frame_rows(report),
+        total_s=max(sum(summary["timings_s"].values()), 1e-9),
+        css=Markup(asset("report.css")),
+        js=Markup(asset("report.js")),
+        plotly=Markup(get_plotlyjs()),
+        payload=Markup(_script_json(_payload(report, scales))),
+    )
+
+
+def _badge(word: str, what: str) -> str:
+    """Words come from `uwsfm.calibration`, none from the user."""
+    kind = _BADGES.get(word, "plain")
+    sign = f"{_SIGNS[kind]} " if kind in _SIGNS else ""
+    text = f"{what} {word}" if what else word
+    return f'<span class="badge {kind}">{sign}{text}</span>'
+
+
+def scales_of(camera: CameraResiduals) -> Scales:
+    """Wide enough for the larger of the two models."""
+    models = [m for m in (camera.pinhole, camera.refractive) if m is not None]
+    lengths = [np.linalg.norm(model.cells_px, axis=2) for model in models]
+    known = np.concatenate([length[np.isfinite(length)] for length in lengths])
+    largest = float(np.percentile(known, 95.0)) if len(known) else 0.1
+    cell = max(camera.size) / max(camera.counts.shape)
+    profile = max(map(_largest, models))
+    return Scales(
+        map_px=max(largest, 1e-3),
+        factor=max(1, round(_one_digit(0.9 * cell / max(largest, 1e-3)))),
+        profile_px=1.1 * max(profile, 1e-3),
+    )
+
+
+def _largest(model: Residuals) -> float:
+    profiles: Sequence[Profile] = (*model.by_radius, *model.by_depth)
+    values = np.concatenate([np.abs(p.mean_px) + p.stderr_px for p in profiles])
+    return float(np.nanmax(values, initial=0.0))
+
+
+def _one_digit(value: float) -> float:
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * math.floor(value / power)
+
+
+def cost_unit(summary: dict[str, Any]) -> str:
+    """Of the root of the cost per observation."""
+    errors = {solve["error"] for solve in summary["solves"]}
+    return "px" if errors == {"reprojection"} else "m"
+
+
+def _view_caption(report: Report) -> str:
+    view, parts = report.view, []
+    shown, count = len(view.points), view.num_all_points
+    parts.append(f"{count} points; frusta run as the cameras' rays do in the water.")
+    if shown + view.num_outlying < count:
+        parts.append(f"{shown} of them, chosen at random, are drawn.")
+    if view.num_outlying:
+        parts.append(f"{view.num_outlying} lie far outside and are not drawn.")
+    if view.frusta_step > 1:
+        parts.append(
+            f"Every {view.frusta_step}th frame has its cameras drawn, the trajectory "
+            "has all."
+        )
+    if np.any(view.origin):
+        place = ", ".join(f"{value:.0f}" for value in view.origin)
+        parts.append(f"Coordinates are relative to ({place}) {report.unit}.")
+    return " ".join(parts)
+
+
+def _pinhole_models(report: Report) -> str:
+    larger = {"FULL_OPENCV", "OPENCV_FISHEYE"}
+    models = {c.model for c in report.residuals if c.pinhole is not None} & larger
+    return "COLMAP's OPENCV" + "".join(f" or {model}" for model in sorted(models))
+
+
+def _residual_words(camera: CameraResiduals, report: Report) -> str:
+    ours = camera.refractive
+    noise = f"{ours.rms_px:.3g} px RMS"
+    if camera.pinhole is None:
+        return (
+            "There is no pinhole to compare with: this camera has no port, or too few "
+            f"observations. uwsfm leaves {noise}, of which "
+            f"{_systematic(ours.systematic_px)} is systematic."
+        )
+    theirs = camera.pinhole
+    text = (
+        f"The pinhole leaves {theirs.rms_px:.3g} px RMS, of which "
+        f"{_systematic(theirs.systematic_px)} is systematic by place in the image and "
+        f"depth; uwsfm leaves {noise}, of which {_systematic(ours.systematic_px)}."
+    )
+    if camera.least_central_px is not None:
+        rms, most = camera.least_central_px
+        text += (
+            " Any lens with a single centre, however distorted and exact at the median "
+            f"depth, is off by {rms:.2g} px RMS and up to {most:.2g} px at the 10th "
+            "and 90th percentile of depth."
+        )
+    return text
+
+
+def _systematic(value: float) -> str:
+    if not math.isfinite(value):
+        return "an unknown part"
+    return f"{value:.2g} px" if value >= 0.005 else "less than 0.005 px"
+
+
+@dataclass(frozen=True)
+class _Row:
+    name: str
+    cells: list[tuple[str, str]]
+    """What is sorted by, and what is shown."""
+
+
+def _frame_rows(report: Report) -> list[_Row]:
+    rows = []
+    for frame in report.frames:
+        counts = (frame.num_images, frame.num_points, frame.num_observations)
+        cells = [(str(count), str(count)) for count in counts]
+        for error in (frame.mean_error_px, frame.rms_error_px):
+            cells.append((f"{error:.6g}", f"{error:.3f}"))
+        for value, scale in (
+            (frame.position_stddev_m, 1e3),
+            (frame.rotation_stddev_deg, 1.0),
+        ):
+            known = math.isfinite(value)
+            cells.append(
+                (f"{value:.6g}", deviation(value, scale)) if known else ("", "-")
+            )
+        rows.append(_Row(frame.name, cells))
+    return rows
+
+
+def _payload(report: Report, scales: list[Scales]) -> dict[str, Any]:
+    """What the script of the page draws from."""
+    return {
+        "unit": report.unit,
+        "small_unit": report.small_unit,
+        "cost_unit": cost_unit(report.summary),
+        "solves": report.summary["solves"],
+        "residuals": plain(report.residuals),
+        "scales": plain(scales),
+        "view": _view_payload(report.view, [frame.name for frame in report.frames]),
+    }
+
+
+def _view_payload(view: View, names: list[str]) -> dict[str, Any]:
+    places = np.concatenate([view.points, view.trajectory, *view.frusta])
+    low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    room = 0.03 * max(float((high - low).max()), 1e-6)
+    low, high = low - room, high + room
+    span = high - low
+    looked_at = np.median(view.points, axis=0) if len(view.points) else low
+    middle = 0.5 * (looked_at + np.median(view.trajectory, axis=0))
+    return {
+        "points": _packed(view.points),
+        "colors": base64.b64encode(view.colors.tobytes()).decode("ascii"),
+        "error": _packed(view.error_px),
+        "stddev": _packed(1e3 * view.stddev_m),
+        "limits": {
+            "error": _limits(view.error_px),
+            "stddev": _limits(1e3 * view.stddev_m),
+        },
+        "frusta": [_packed(lines) for lines in view.frusta],
+        "trajectory": _packed(view.trajectory),
+        "names": names,
+        "sight": view.sight.tolist(),
+        "up": view.up.tolist(),
+        "ranges": np.stack([low, high], axis=1).tolist(),
+        "aspect": (span / span.max()).tolist(),
+        "middle": ((middle - 0.5 * (low + high)) / span.max()).tolist(),
+    }
+
+
+def _packed(values: ArrayLike) -> str:
+    """32-bit floats, little-endian, as text."""
+    return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")
+
+
+def _limits(values: ArrayLike) -> list[float]:
+    """From zero to what all but a few stay below."""
+    known = np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return [0.0, float(np.percentile(known, 95.0)) if len(known) else 1.0]
+
+
+def _script_json(data: dict[str, Any]) -> str:
+    """JSON that may stand inside a script element, whatever its texts are."""
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c")

@@ -1,0 +1,165 @@
+"""The verdict of a report, in words: what summary.json says, as sentences."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+ARBITRARY_UNIT = "scale arbitrary"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What a reader needs first."""
+
+    metric: str
+    """Whether lengths are metres, one or two sentences."""
+    metric_word: str
+    """"determined", "weakly determined", "not determined" or "arbitrary"."""
+    frames: str
+    fit: str
+    ports: tuple["PortVerdict", ...]
+    open: tuple[str, ...]
+    """What is not determined or doubtful, and what to do about it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PortVerdict:
+    """How well the port of one camera is known."""
+
+    camera: str
+    text: str
+    words: tuple[tuple[str, str], ...]
+    """What, and the word for how well the images determine it."""
+
+
+def verdict_of(summary: dict[str, Any]) -> Verdict:
+    """The verdict of a summary.json."""
+    rms = summary["reprojection_rms_px"]
+    registered, frames = summary["num_registered_frames"], summary["num_frames"]
+    points, count = summary["num_points"], summary["num_observations"]
+    before = rms["before"]
+    return Verdict(
+        metric=_metric(summary),
+        metric_word=summary["scale"]["verdict"],
+        frames=f"{registered} of {frames} frames are registered, with {points} points "
+        f"seen in {count} observations.",
+        fit=f"The true reprojection error is {rms['after']:.3g} px RMS"
+        + ("" if before is None else f", before the adjustment {before:.3g} px")
+        + ".",
+        ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
+        open=tuple(_sentence(text) for text in summary["warnings"]),
+    )
+
+
+def small_unit_of(summary: dict[str, Any]) -> str:
+    """What 1e-3 of a length is called, short enough for a table."""
+    return "1e-3 units" if unit_of(summary) == "units" else "mm"
+
+
+def unit_of(summary: dict[str, Any]) -> str:
+    """Of lengths: "m", or "units" if nothing determines the scale."""
+    return "units" if summary["scale"]["unit"] == ARBITRARY_UNIT else "m"
+
+
+def rounded(value: float, stddev: float | None, scale: float = 1.0) -> str:
+    """A number with the digits that its standard deviation leaves it."""
+    value = scale * value
+    if stddev is None or not stddev > 0.0:
+        return f"{value:.6g}"
+    return f"{value:.{_decimals(scale * stddev)}f}"
+
+
+def deviation(stddev: float | None, scale: float = 1.0) -> str:
+    """A standard deviation with two digits."""
+    if stddev is None:
+        return "-"
+    if not stddev > 0.0:
+        return "0"
+    return f"{scale * stddev:.{_decimals(scale * stddev)}f}"
+
+
+def _decimals(stddev: float) -> int:
+    """Decimals that show two digits of a standard deviation."""
+    return min(max(1 - math.floor(math.log10(stddev)), 0), 9)
+
+
+def with_deviation(
+    value: float, stddev: float | None, unit: str, scale: float = 1.0
+) -> str:
+    known = "" if stddev is None else f" ± {deviation(stddev, scale)}"
+    return f"{rounded(value, stddev, scale)}{known} {unit}"
+
+
+def tilts_deg(normal: list[float]) -> tuple[float, float]:
+    """The normal's slopes against the optical axis, which people can imagine."""
+    x, y = (math.degrees(math.asin(value)) for value in normal[:2])
+    return x, y
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '?')) else '.'}"
+
+
+def _metric(summary: dict[str, Any]) -> str:
+    scale = summary["scale"]
+    word, stddev = scale["verdict"], scale["relative_stddev"]
+    if word == "arbitrary":
+        return (
+            "The model is not metric: nothing determines its scale, and every length "
+            "below is in an arbitrary unit."
+        )
+    if word == "not determined":
+        return "The model is not metric: what was given does not determine its scale."
+    known = f"the distance between frames far apart is known to {1e2 * stddev:.2g} %"
+    kind = "metric" if word == "determined" else "metric, but weakly"
+    return f"The model is {kind}: {known}. {_source(summary)}"
+
+
+def _source(summary: dict[str, Any]) -> str:
+    """Where the scale comes from."""
+    baseline, stddev = summary["baseline_m"], summary["baseline_stddev_m"]
+    sources = []
+    if baseline is not None:
+        exact = f"± {1e3 * stddev:.2g} mm" if stddev > 0.0 else "taken as exact"
+        sources.append(f"the baseline of {1e3 * baseline:.5g} mm, {exact}")
+    if summary.get("known_lengths"):
+        sources.append(f"{len(summary['known_lengths'])} known lengths")
+    if summary.get("positions"):
+        used = summary["positions"]
+        count = used["num_positions"] - len(used["outliers"])
+        sources.append(f"{count} positions of frames")
+    if not sources:
+        return "Its scale comes from refraction alone, with the port taken as given."
+    text = f"Its scale comes from {', and from '.join(sources)}."
+    if baseline is not None and stddev == 0.0 and len(sources) == 1:
+        text += " One per cent wrong there is one per cent wrong everywhere."
+    return text
+
+
+def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
+    name, unit = camera["name"], small_unit_of(summary)
+    if camera["port"] == "none":
+        return PortVerdict(camera=name, text="no port", words=())
+    if camera["port"] == "dome":
+        parts = zip(camera["center_m"], camera["center_stddev_m"], strict=True)
+        center = ", ".join(with_deviation(v, s, unit, 1e3) for v, s in parts)
+        return PortVerdict(
+            camera=name,
+            text=f"dome, its centre at {center} from the projection centre",
+            words=(("centre", camera["center_verdict"]),),
+        )
+    stddev = camera["normal_stddev_deg"]
+    tilt = ", ".join(rounded(value, stddev) for value in tilts_deg(camera["normal"]))
+    known = "" if stddev is None else f" ± {deviation(stddev)}"
+    distance = with_deviation(
+        camera["distance_m"], camera["distance_stddev_m"], unit, 1e3
+    )
+    return PortVerdict(
+        camera=name,
+        text=f"flat port, its normal tilted by {tilt}{known} deg towards x and y, at "
+        f"{distance} from the projection centre",
+        words=(
+            ("tilt", camera["normal_verdict"]),
+            ("distance", camera["distance_verdict"]),
+        ),
+    )
