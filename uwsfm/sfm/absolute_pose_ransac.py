@@ -12,9 +12,9 @@ import numpy as np
 from uwsfm._jit import inner, kernel
 from uwsfm.geometry.p3p import poses_from_three
 from uwsfm.models.status import VALID
-from uwsfm.residuals.reprojection import residual
+from uwsfm.residuals.reprojection import point_in_rig, residual
 from uwsfm.solver.losses import LOSS_CODES
-from uwsfm.solver.rig_pose import copy_into, in_rig, refine_pose, squared_errors
+from uwsfm.solver.rig_pose import copy_into, refine_pose, squared_errors
 
 CAUCHY = LOSS_CODES["cauchy"]
 LOCAL_ITERATIONS = 3
@@ -30,7 +30,7 @@ def truncated_error(pose, matches, rig, limit, best):
     total, inliers = 0.0, 0
     for i in range(len(points)):
         c = camera_idx[i]
-        x, y, z = in_rig(pose, points[i])
+        x, y, z = point_in_rig(pose, points[i])
         status, rx, ry = residual(x, y, z, xy[i], cams[c], lenses[c], ports[c])
         square = rx * rx + ry * ry if status == VALID else math.inf
         if square < limit:

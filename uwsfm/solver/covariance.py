@@ -111,17 +111,32 @@ def reduced_covariance(
 
 
 @inner
-def _add_products(left, middle, right, twice, out):
-    """out (3, 3) += L^T M R, or L^T M R + (L^T M R)^T; L (a, 3), M (a, b), R (b, 3)."""
+def _product(left, middle, right, out):
+    """out (3, 3) = L^T M R; L (a, 3), M (a, b), R (b, 3)."""
     for i in range(3):
         for j in range(3):
             total = 0.0
             for a in range(middle.shape[0]):
                 for b in range(middle.shape[1]):
                     total += left[a, i] * middle[a, b] * right[b, j]
-            out[i, j] += total
-            if twice:
-                out[j, i] += total
+            out[i, j] = total
+
+
+@inner
+def _add(part, out):
+    """out (3, 3) += part."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += part[i, j]
+
+
+@inner
+def _add_both_ways(part, out):
+    """out (3, 3) += part + part^T."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += part[i, j]
+            out[j, i] += part[i, j]
 
 
 @inner
@@ -147,33 +162,36 @@ def _point_covariances(point_start, graph, eqs, known, first, last, out):
         largest = max(largest, point_start[p + 1] - point_start[p])
     reach = np.empty((largest, 6, 3))
     inverse_block, sideways = np.empty((3, 3)), np.empty((len(border), 3))
+    part = np.empty((3, 3))
     for p in range(first, last):
-        if not schur.invert_damped(points[p], 0.0, inverse_block):
-            for a in range(3):
-                for b in range(3):
-                    out[p, a, b] = math.nan
-            continue
+        regular = schur.invert_damped(points[p], 0.0, inverse_block)
         for a in range(3):
             for b in range(3):
-                out[p, a, b] = inverse_block[a, b]
+                out[p, a, b] = inverse_block[a, b] if regular else math.nan
+        if not regular:
+            continue
         _multiply(points_border[p].T, inverse_block, sideways)
-        _add_products(sideways, border, sideways, False, out[p])
+        _product(sideways, border, sideways, part)
+        _add(part, out[p])
         start = point_start[p]
         for c in range(start, point_start[p + 1]):
             i = cell_row[c]
             if i == HELD:
                 continue
             _multiply(cells[c], inverse_block, reach[c - start])
-            _add_products(reach[c - start], coupling[i], sideways, True, out[p])
+            _product(reach[c - start], coupling[i], sideways, part)
+            _add_both_ways(part, out[p])
             s = row_start[i]
             for other in range(start, c + 1):
                 j = cell_row[other]
                 if j == HELD:
                     continue
                 s = find_block(row_start, row_other, i, j, s)
-                _add_products(
-                    reach[other - start], blocks[s], reach[c - start], j != i, out[p]
-                )
+                _product(reach[other - start], blocks[s], reach[c - start], part)
+                if j != i:
+                    _add_both_ways(part, out[p])
+                else:
+                    _add(part, out[p])
 
 
 def point_covariances(

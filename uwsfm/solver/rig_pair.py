@@ -15,10 +15,10 @@ from uwsfm._jit import inner, kernel
 from uwsfm.geometry.vec3 import dot
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
+from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.solver.losses import INVALID_PX, rho
 from uwsfm.solver.rig_pose import (
     copy_into,
-    in_rig,
     moved_pose,
     slope_along,
     solve_damped,
@@ -45,7 +45,7 @@ def rows_in_rig(x, y, z, cam, lens, port, jac, rows):
     Returns:
         (status, px, py).
     """
-    px, py, pz = in_rig(cam, (x, y, z))
+    px, py, pz = point_in_rig(cam, (x, y, z))
     status, u, v = project_with_jac(px, py, pz, lens, port, jac)
     if status == VALID:
         for i in range(2):
@@ -67,7 +67,7 @@ def midpoint(pose, ray_a, ray_b):
     nan = math.nan
     dax, day, daz = ray_a[3], ray_a[4], ray_a[5]
     # The first ray in the second rig.
-    oa = in_rig(pose, ray_a)
+    oa = point_in_rig(pose, ray_a)
     da = (
         pose[0] * dax + pose[1] * day + pose[2] * daz,
         pose[4] * dax + pose[5] * day + pose[6] * daz,

@@ -12,7 +12,7 @@ from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
-from uwsfm.residuals.reprojection import residual
+from uwsfm.residuals.reprojection import point_in_rig, residual
 from uwsfm.solver.losses import INVALID_PX, rho
 
 POSE_SIZE = 6
@@ -22,17 +22,6 @@ MIN_EIGENVALUE = 1e-12
 """Of a scaled Hessian: what is smaller is rounding."""
 MIN_RELATIVE_DECREASE = 1e-7
 """Of some hundred observations: one hundredth of a standard deviation of the pose."""
-
-
-@inner
-def in_rig(pose, point):
-    """A point (3,) moved by a row of [R | t]."""
-    x, y, z = point[0], point[1], point[2]
-    return (
-        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
-        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
-        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
-    )
 
 
 @kernel
@@ -49,7 +38,7 @@ def squared_errors(pose, matches, rig, squares):
     cams, lenses, ports = rig
     for i in range(len(points)):
         c = camera_idx[i]
-        x, y, z = in_rig(pose, points[i])
+        x, y, z = point_in_rig(pose, points[i])
         status, rx, ry = residual(x, y, z, xy[i], cams[c], lenses[c], ports[c])
         squares[i] = rx * rx + ry * ry if status == VALID else math.inf
 
@@ -64,7 +53,7 @@ def pose_cost(pose, matches, use, rig, loss, scale):
         if not use[i]:
             continue
         c = camera_idx[i]
-        x, y, z = in_rig(pose, points[i])
+        x, y, z = point_in_rig(pose, points[i])
         status, rx, ry = residual(x, y, z, xy[i], cams[c], lenses[c], ports[c])
         square = rx * rx + ry * ry if status == VALID else INVALID_PX * INVALID_PX
         value, _ = rho(square, loss, scale)
@@ -87,8 +76,8 @@ def normal_equations(pose, matches, use, rig, loss, scale, hessian, grad):
             continue
         c = camera_idx[i]
         cam = cams[c]
-        x, y, z = in_rig(pose, points[i])
-        px, py, pz = in_rig(cam, (x, y, z))
+        x, y, z = point_in_rig(pose, points[i])
+        px, py, pz = point_in_rig(cam, (x, y, z))
         status, u, v = project_with_jac(px, py, pz, lenses[c], ports[c], jac)
         if status != VALID:
             value, _ = rho(INVALID_PX * INVALID_PX, loss, scale)

@@ -112,6 +112,7 @@ def _gather(chains, points, keypoints):
 def errors_px(views: Views, keypoints: IndexArray, places: Array) -> Array:
     """True pixel errors (n,) of keypoints at world points (n, 3); inf if invalid."""
     errors = np.empty(len(keypoints))
+    keypoints = np.ascontiguousarray(keypoints)
     _errors_batch(views, keypoints, np.ascontiguousarray(places), errors)
     return errors
 

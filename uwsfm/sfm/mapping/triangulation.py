@@ -306,7 +306,7 @@ def triangulate_batch(
         largest = max(largest, track_start[t + 1] - track_start[t])
     left, chosen = np.empty(largest, np.int64), np.empty(largest, np.int64)
     jac = np.empty((2, JAC_SIZE))
-    num_points = 0
+    num_points = np.int64(0)  # `_take` would be compiled once more for a literal
     for t in range(len(track_start) - 1):
         track = keypoints[track_start[t] : track_start[t + 1]]
         mine = point_of[track_start[t] : track_start[t + 1]]
