@@ -128,7 +128,6 @@ def solve(num_frames: int, folder: str) -> dict[str, Any]:
             num_threads=2,
             num_frames=num_frames,
             folder=folder,
-            iterations_on_two=3,
         )
         if not found["compiled"]:
             break

@@ -41,17 +41,19 @@ _PLACES: tuple[tuple[str, Any, str], ...] = (
     ("eliminate points", schur, "reduced_system"),
     ("substitute back", schur, "substitute_back"),
 )
+MAX_ITERATIONS = 50
 Solve = Callable[[int], LevenbergMarquardtResult]
 
 
-def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, Any]:
+def measure(num_frames: int, folder: str) -> dict[str, Any]:
     """Times, memory and convergence of one survey.
+
+    Both solves run to their end: where they start, one cost and one linearisation come
+    before the first iteration, which are to weigh the same in both.
 
     Args:
         num_frames: A size in `surveys.SPECS`.
         folder: Of the surveys.
-        iterations_on_two: How many are timed on two threads; the solve on one thread
-            runs to its end.
     """
     truth = surveys.load(num_frames, folder)
     start = surveys.start_of(truth)
@@ -68,9 +70,11 @@ def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, A
         options = LevenbergMarquardtOptions(max_iterations=max_iterations)
         return minimize(layout, state, options)
 
-    one, result = _timed(solve, layout, num_threads=1, max_iterations=50)
+    one, result = _timed(solve, layout, num_threads=1)
     peak = peak_memory_mb()
-    two, _ = _timed(solve, layout, num_threads=2, max_iterations=iterations_on_two)
+    two, _ = _timed(solve, layout, num_threads=2)
+    if two["iterations"] != one["iterations"]:
+        raise RuntimeError("two threads took another way than one")
     distances = result.state.ports[:, 3]
     return {
         "frames": start.num_frames,
@@ -94,13 +98,13 @@ def measure(num_frames: int, folder: str, iterations_on_two: int) -> dict[str, A
 
 
 def _timed(
-    solve: Solve, layout: Layout, num_threads: int, max_iterations: int
+    solve: Solve, layout: Layout, num_threads: int
 ) -> tuple[dict[str, Any], LevenbergMarquardtResult]:
     with limited(num_threads), threadpool_limits(num_threads):
         solve(1)  # loads the kernels and touches the memory
         with stopwatch() as clocks:
             wall, cpu = time.perf_counter(), time.process_time()
-            result = solve(max_iterations)
+            result = solve(MAX_ITERATIONS)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     count = result.num_iterations
     # Found once, however many iterations there are.
