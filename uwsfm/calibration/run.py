@@ -211,7 +211,7 @@ class Run:
         return with_terms(own, terms, State.from_scene(self.known))
 
     def optimum(self, solved: Solved, sigma_px: float) -> Optimum:
-        frames = np.unique(solved.layout.cell_frame)
+        frames = np.unique(solved.layout.cell_frame).astype(np.int64)
         return Optimum(
             layout=solved.layout,
             state=solved.part,

@@ -14,6 +14,9 @@ from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.elimination_tree import EliminationTree, Front
 
+SOLVED_AT_ONCE = 48
+"""Rows, by a triangle that the L1 cache holds."""
+
 
 class Panel(NamedTuple):
     """The factor's part of one front: rows of L^T."""
@@ -40,25 +43,34 @@ def _place_blocks(blocks, slots, where, own, rest):
 
 
 @kernel
-def _add_update(update, places, own, rest, after):
-    """Add what a child left, to the upper triangle of a front."""
+def _add_to_pivots(update, places, own, rest):
+    """Add what a child left of the pivots' rows, to the upper triangle of a front."""
     k = len(own)
     for i in range(len(places)):
         row = 6 * places[i]
-        for j in range(i, len(places)):
-            col = 6 * places[j]
-            if col < k:
-                for a in range(6):
-                    for b in range(6):
-                        own[row + a, col + b] += update[6 * i + a, 6 * j + b]
-            elif row < k:
-                for a in range(6):
-                    for b in range(6):
-                        rest[row + a, col - k + b] += update[6 * i + a, 6 * j + b]
-            else:
-                for a in range(6):
-                    for b in range(6):
-                        after[row - k + a, col - k + b] += update[6 * i + a, 6 * j + b]
+        if row >= k:  # places rise
+            return
+        for a in range(6):
+            for j in range(i, len(places)):
+                col = 6 * places[j]
+                for b in range(6):
+                    value = update[6 * i + a, 6 * j + b]
+                    if col < k:
+                        own[row + a, col + b] += value
+                    else:
+                        rest[row + a, col - k + b] += value
+
+
+@kernel
+def _add_to_rows(update, places, k, after):
+    """Add what a child left of the rows after k pivots, to their upper triangle."""
+    for i in range(np.searchsorted(places, k // 6), len(places)):
+        for a in range(6):
+            source, target = update[6 * i + a], after[6 * places[i] - k + a]
+            for j in range(i, len(places)):
+                col = 6 * places[j] - k
+                for b in range(6):
+                    target[col + b] += source[6 * j + b]
 
 
 @kernel
@@ -94,6 +106,52 @@ def _gather(own, rest, after, places, out):
                     out[6 * i + a, 6 * j + b] = value
 
 
+class _Pool:
+    """Square arrays that factors use again: new pages would have to be cleared, which
+    took as long as a quarter of the sums."""
+
+    def __init__(self) -> None:
+        self._free: list[Array] = []
+
+    def take(self, size: int) -> Array:
+        """Any numbers (size, size), in the smallest array that is free."""
+        count = len(self._free)
+        fitting = [k for k in range(count) if self._size(k) >= size * size]
+        if fitting:
+            flat = self._free.pop(min(fitting, key=self._size))
+        else:
+            if self._free:  # one grows; the others wait for smaller fronts
+                self._free.pop(max(range(len(self._free)), key=self._size))
+            flat = np.empty(size * size)
+        return flat[: size * size].reshape(size, size)
+
+    def give(self, square: Array) -> None:
+        """An array of `take` that is not needed any more."""
+        assert square.base is not None  # the whole of which `take` gave a part
+        self._free.append(square.base)
+
+    def _size(self, number: int) -> int:
+        return self._free[number].size
+
+
+def _solve_rows(own: Array, rest: Array) -> None:
+    """R12 = R11^-T A12 in place, most of it by products of matrices: BLAS solves at
+    half their speed."""
+    for first in range(0, len(own), SOLVED_AT_ONCE):
+        part = slice(first, first + SOLVED_AT_ONCE)
+        if first:
+            rest[part] -= own[:first, part].T @ rest[:first]
+        blas.dtrsm(
+            1.0,
+            np.ascontiguousarray(own[part, part]).T,
+            rest[part].T,
+            side=1,
+            lower=1,
+            trans_a=1,
+            overwrite_b=1,
+        )
+
+
 class BlockCholesky:
     """A factor L of the frames' part, A = L L^T in the order of a tree."""
 
@@ -108,6 +166,7 @@ class BlockCholesky:
             for f in tree.fronts
         ]
         self._rows = [_in_columns(f) for f in tree.fronts]
+        self._pool = _Pool()
 
     def factorize(self, blocks: Array) -> bool:
         """Factor blocks (number of blocks, 6, 6); False if they are not positive."""
@@ -115,20 +174,24 @@ class BlockCholesky:
         for number, front in enumerate(self._fronts):
             own, rest = self._panels[number]
             own[...], rest[...] = 0.0, 0.0
-            after = np.zeros((rest.shape[1], rest.shape[1]))
             _place_blocks(blocks, front.slots, front.where, own, rest)
-            for child, places in zip(front.children, front.maps, strict=True):
-                _add_update(updates.pop(child), places, own, rest, after)
+            given = [updates.pop(child) for child in front.children]
+            for update, places in zip(given, front.maps, strict=True):
+                _add_to_pivots(update, places, own, rest)
             # Fortran reads rows as columns: our upper triangles are its lower ones.
             _, info = lapack.dpotrf(own.T, lower=1, clean=0, overwrite_a=1)
             if info != 0:
                 return False
             if rest.size:
-                blas.dtrsm(
-                    1.0, own.T, rest.T, side=1, lower=1, trans_a=1, overwrite_b=1
-                )
-                blas.dsyrk(-1.0, rest.T, beta=1.0, c=after.T, lower=1, overwrite_c=1)
+                _solve_rows(own, rest)
+                after = self._pool.take(rest.shape[1])
+                # Written, then added to: nothing to zero beforehand.
+                blas.dsyrk(-1.0, rest.T, beta=0.0, c=after.T, lower=1, overwrite_c=1)
+                for update, places in zip(given, front.maps, strict=True):
+                    _add_to_rows(update, places, len(own), after)
                 updates[number] = after
+            for update in given:
+                self._pool.give(update)
         return bool(np.isfinite([np.sum(p.own[-1]) for p in self._panels]).all())
 
     def solve_half(self, right: Array) -> Array:

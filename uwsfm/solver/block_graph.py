@@ -10,7 +10,7 @@ import numpy as np
 
 from uwsfm._jit import inner, kernel
 from uwsfm.scene import IndexArray
-from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.layout import HELD, Layout, ShortIndexArray
 
 MANY_BLOCKS = 30_000
 """Of 288 bytes each."""
@@ -21,7 +21,7 @@ class BlockGraph(NamedTuple):
 
     frame: IndexArray
     """(F,) of the scene."""
-    cell_row: IndexArray
+    cell_row: ShortIndexArray
     """(K,) free frame of each cell, or HELD."""
     point_order: IndexArray
     """(P,) to go through them in: as they come, which is how their cells lie in memory;
@@ -47,26 +47,30 @@ class BlockGraph(NamedTuple):
 def build_graph(layout: Layout) -> BlockGraph:
     """The pattern of a layout's reduced system."""
     frame = np.flatnonzero(layout.frame_col != HELD)
-    row_of = np.full(len(layout.frame_col), HELD, dtype=np.int64)
+    row_of = np.full(len(layout.frame_col), HELD, dtype=np.int32)
     row_of[frame] = np.arange(len(frame))  # columns rise with the frames
     cell_row = row_of[layout.cell_frame]
     point_start = layout.point_start
-    point = np.repeat(np.arange(len(point_start) - 1), np.diff(point_start))
-    free = cell_row != HELD
-    counts = np.bincount(cell_row[free], minlength=len(frame))
-    entry_start = np.concatenate([[0], np.cumsum(counts)])
-    # Cells by frame; the stable sort keeps them rising. HELD comes first.
-    entry_cell = np.argsort(cell_row, kind="stable")[np.count_nonzero(~free) :]
-    entries = (point_start, cell_row, entry_start, entry_cell, point[entry_cell])
+    counts = np.bincount(cell_row + 1, minlength=len(frame) + 1)  # HELD comes first
+    entry_start = np.concatenate([[0], np.cumsum(counts[1:])])
+    entry_cell, entry_point = np.empty((2, entry_start[-1]), dtype=np.int32)
+    first_row = np.full(len(point_start) - 1, len(frame))
+    _list_entries(
+        point_start,
+        cell_row,
+        entry_start[:-1].copy(),
+        entry_cell,
+        entry_point,
+        first_row,
+    )
+    entries = (point_start, cell_row, entry_start, entry_cell, entry_point)
     num_blocks, work = np.zeros((2, len(frame)), dtype=np.int64)
     _count_blocks(entries, num_blocks, work)
     row_start = np.concatenate([[0], np.cumsum(num_blocks)])
     row_other = np.empty(row_start[-1], dtype=np.int64)
     _list_blocks(entries, row_start, row_other)
-    first_row = np.zeros(len(point_start) - 1, dtype=np.int64)
-    if len(row_other) > MANY_BLOCKS:
-        first_row[:] = len(frame)
-        np.minimum.at(first_row, point[free], cell_row[free])
+    if len(row_other) <= MANY_BLOCKS:
+        first_row[:] = 0
     return BlockGraph(
         frame=frame,
         cell_row=cell_row,
@@ -75,6 +79,20 @@ def build_graph(layout: Layout) -> BlockGraph:
         row_other=row_other,
         work_start=np.concatenate([[0], np.cumsum(work)]),
     )
+
+
+@kernel
+def _list_entries(
+    point_start, cell_row, next_entry, entry_cell, entry_point, first_row
+):
+    """Cells and points of each row, rising, and the first row of each point."""
+    for p in range(len(first_row)):
+        for c in range(point_start[p], point_start[p + 1]):
+            i = cell_row[c]
+            if i != HELD:
+                first_row[p] = min(first_row[p], i)
+                entry_cell[next_entry[i]], entry_point[next_entry[i]] = c, p
+                next_entry[i] += 1
 
 
 @inner

@@ -16,17 +16,20 @@ from uwsfm.scene import IndexArray, Scene
 
 HELD = -1
 
+ShortIndexArray = NDArray[np.int32]
+"""Frames and cameras of every observation: half the memory."""
+
 
 class Layout(NamedTuple):
     """Index arrays that kernels read; K cells, N observations, B border columns."""
 
     xy: Array
     """(N, 2) observations in sorted order."""
-    camera: IndexArray
+    camera: ShortIndexArray
     """(N,) camera of each sorted observation."""
     cell_start: IndexArray
     """(K + 1,) first observation of each cell."""
-    cell_frame: IndexArray
+    cell_frame: ShortIndexArray
     """(K,) frame of each cell, rising within a point."""
     point_start: IndexArray
     """(P + 1,) first cell of each point."""
@@ -34,7 +37,7 @@ class Layout(NamedTuple):
     """(F,) first of a frame's 6 columns in the reduced system, or HELD."""
     border_col: IndexArray
     """(C, BORDER_SIZE) column of each camera parameter in the border, or HELD."""
-    order: IndexArray
+    order: ShortIndexArray
     """(N,) index of each sorted observation in the scene."""
     free_start: IndexArray
     """(C + 1,) first of a camera's entries in ``free_slot``."""
@@ -90,25 +93,27 @@ def build_layout(
     """
     if scene.num_observations == 0:
         raise InputError("the scene has no observations")
-    order = np.lexsort((scene.camera_idx, scene.frame_idx, scene.point_idx))
-    point, frame = scene.point_idx[order], scene.frame_idx[order]
+    keys = (scene.camera_idx, scene.frame_idx, scene.point_idx)
+    order: ShortIndexArray = np.lexsort(keys).astype(np.int32)
+    point = scene.point_idx[order].astype(np.int32)
+    frame = scene.frame_idx[order].astype(np.int32)
     new_cell = np.ones(len(order), dtype=bool)
-    new_cell[1:] = (np.diff(point) != 0) | (np.diff(frame) != 0)
+    new_cell[1:] = (point[1:] != point[:-1]) | (frame[1:] != frame[:-1])
     starts = np.nonzero(new_cell)[0]
     cells_of_point = np.bincount(point[starts], minlength=scene.num_points)
-    observed = np.unique(frame)
+    observed = np.flatnonzero(np.bincount(frame))
     frame_col = np.full(scene.num_frames, HELD, dtype=np.int64)
     free = observed[1:] if held_frames is None else observed[~held_frames[observed]]
     frame_col[free] = 6 * np.arange(len(free))
     layout = Layout(
         xy=np.ascontiguousarray(scene.xy[order]),
-        camera=np.ascontiguousarray(scene.camera_idx[order]),
+        camera=scene.camera_idx[order].astype(np.int32),
         cell_start=np.append(starts, len(order)).astype(np.int64),
-        cell_frame=np.ascontiguousarray(frame[starts]),
+        cell_frame=frame[starts],
         point_start=np.concatenate([[0], np.cumsum(cells_of_point)]).astype(np.int64),
         frame_col=frame_col,
         border_col=border_col,
-        order=order.astype(np.int64),
+        order=order,
         free_start=np.empty(0, dtype=np.int64),
         free_slot=np.empty(0, dtype=np.int64),
         free_col=np.empty(0, dtype=np.int64),
