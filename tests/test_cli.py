@@ -26,6 +26,7 @@ COMMANDS = [
     ["demo"],
     ["batch"],
     ["clean"],
+    ["color"],
     ["export"],
     ["map"],
     ["report"],

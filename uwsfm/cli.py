@@ -28,7 +28,7 @@ from uwsfm.cli_options import (
     wanted_of,
 )
 from uwsfm.cli_simulate import simulate_app
-from uwsfm.cli_surface import clean, map_
+from uwsfm.cli_surface import clean, color, map_
 from uwsfm.cli_view import report, view
 from uwsfm.errors import InputError, UwsfmError
 
@@ -47,6 +47,7 @@ app.command()(export)
 app.command()(batch)
 app.command()(dense)
 app.command()(clean)
+app.command()(color)
 app.command("map")(map_)
 app.command()(report)
 app.command()(view)

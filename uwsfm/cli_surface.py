@@ -117,6 +117,89 @@ def map_(
     typer.echo(f"wrote {out}: height.tif, ortho.tif, map.json, map.png")
 
 
+def color(
+    model: Annotated[
+        Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the images, if they are no longer where they were.",
+            show_default=False,
+        ),
+    ] = None,
+    write_images: Annotated[
+        bool,
+        typer.Option("--write-images", help="Write the images without water, too."),
+    ] = False,
+    encoding: Annotated[
+        Literal["srgb", "sqrt", "linear"],
+        typer.Option(
+            help="How light became numbers: srgb: cameras' JPEG; sqrt: uwsfm simulate; "
+            "linear: developed without a curve."
+        ),
+    ] = "srgb",
+    white_balance: Annotated[
+        Literal["none", "gray"],
+        typer.Option(help="gray: the median point becomes grey."),
+    ] = "none",
+) -> None:
+    """Estimate what the water does to colours, and take it from points and images.
+
+    From points that were seen from near and from far: attenuation and veil of each
+    channel, by day light; lamps that move with the camera are found out and refused.
+    """
+    from rich.markup import escape
+
+    from uwsfm.color.commands import correct_colors
+    from uwsfm.console import ProgressBars, console
+
+    with ProgressBars() as progress:
+        report = correct_colors(
+            model,
+            out,
+            images=images,
+            write_images=write_images,
+            encoding=encoding,
+            gray=white_balance == "gray",
+            progress=progress,
+        )
+    _print_water(report)
+    for warning in report["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    written = [path.name for path in sorted(out.iterdir())]
+    typer.echo(f"wrote {out}: {', '.join(written)}; assumed: {report['assumed']}")
+
+
+def _print_water(report: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    from uwsfm.console import console
+
+    short = "m" if report["unit"] == "metre" else "arbitrary unit"
+    table = Table(title="Water: ± is one standard deviation", title_justify="left")
+    table.add_column("channel")
+    rows = {
+        f"attenuation, 1/{short}": "attenuation_per_m",
+        f"veil near the camera, 1/{short}": "veil_slope_per_m",
+        f"backscatter, 1/{short}": "backscatter_per_m",
+        "veil of open water": "veil",
+    }
+    for title in rows:
+        table.add_column(title, justify="right")
+    for name, channel in report["channels"].items():
+        cells = [_estimate(channel[key]) for key in rows.values()]
+        table.add_row(name, *cells)
+    console.print(table)
+
+
+def _estimate(entry: dict[str, Any]) -> str:
+    if not entry["determined"]:
+        return "not determined"
+    return f"{entry['value']:.3f} ± {entry['stddev']:.3f}"
+
+
 def _print_filters(report: dict[str, Any]) -> None:
     from rich.table import Table
 
