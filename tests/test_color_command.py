@@ -43,10 +43,8 @@ def paint(out: Path, folder: Path) -> None:
     origins, _ = scene.water_rays()
     ranges = np.linalg.norm(scene.points[scene.point_idx] - origins, axis=1)
     for camera, lens in enumerate(scene.cameras):
-        x, y = (
-            np.arange(STEP / 2, lens.width, STEP),
-            np.arange(STEP / 2, lens.height, STEP),
-        )
+        size = (lens.width, lens.height)
+        x, y = (np.arange(STEP / 2, side, STEP) for side in size)
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         start, direction = lens.ray_from_img(grid)
         for frame in range(scene.num_frames):
