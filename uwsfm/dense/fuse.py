@@ -19,6 +19,9 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 
 AGREE_STDDEVS = 3.0
+HIDDEN_STDDEVS = 15.0
+"""A surface that is nearer to another camera by more than this hides the point, and
+says nothing about it."""
 FOLD = 4096
 _NORMAL_REACH = 2
 """Pixels on each side whose points give the normal."""
@@ -54,7 +57,7 @@ class FuseCounts:
     """Of the depth map."""
     num_confirmed: int
     num_contradicted: int
-    """Other depth maps see something else there."""
+    """More depth maps see something else there than agree."""
     num_unchecked: int
     """Too few other depth maps see anything there."""
 
@@ -166,24 +169,27 @@ def _fused(
     slant = np.einsum("ni,ni->n", normals, sight)
     weight = sensitivity**-2.0
     moved, num_views = np.zeros(len(points)), np.ones(len(points), dtype=np.int64)
-    num_answers = np.ones(len(points), dtype=np.int64)
+    num_against = np.zeros(len(points), dtype=np.int64)
+    seen_by_others = np.zeros(len(points), dtype=bool)
     for other in others:
         told = _told(other, points)
         # A step along the other's sight moves the surface; along ours by this much.
         turn = np.einsum("ni,ni->n", normals, told.sight) / slant
         turn = np.clip(turn, 1.0 / 3.0, 3.0)
         step, spread = told.difference * turn, told.sensitivity * turn
-        limit = AGREE_STDDEVS * noise * np.hypot(sensitivity, spread)
-        num_answers += np.isfinite(step)
+        both = noise * np.hypot(sensitivity, spread)
+        seen_by_others |= np.isfinite(step)
         with np.errstate(invalid="ignore"):
-            agrees = np.abs(step) <= limit
+            agrees = np.abs(step) <= AGREE_STDDEVS * both
+            num_against += ~agrees & (step > -HIDDEN_STDDEVS * both)
         w = spread[agrees] ** -2.0
         moved[agrees] += w * step[agrees]
         weight[agrees] += w
         num_views[agrees] += 1
     points += (moved / weight)[:, None] * sight
-    confirmed = num_views >= min_views
-    keep = confirmed | (num_answers == 1) if keep_single else confirmed
+    contradicted = num_against >= num_views
+    confirmed = (num_views >= min_views) & ~contradicted
+    keep = confirmed | ~seen_by_others if keep_single else confirmed
     kept = block[keep]
     systematic = view.calibration.ravel()[kept]
     fused = Fused(
@@ -194,7 +200,6 @@ def _fused(
         num_views=num_views[keep],
         view_range=distance[keep],
     )
-    contradicted = ~confirmed & (num_answers > num_views)
     counts = [confirmed, contradicted, ~confirmed & ~contradicted]
     return fused, np.array([np.count_nonzero(mask) for mask in counts])
 

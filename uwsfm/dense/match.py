@@ -10,7 +10,7 @@ same from left to right and back, there is none.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,8 +30,10 @@ SPECKLE_PIXELS, SPECKLE_RANGE = 100, 2
 MULTIPLE = 16  # StereoSGBM wants the number of disparities so
 FRACTIONS = 16  # its results are integers in 1/16 px
 
-WINDOW_PX = 2.0
-"""Standard deviation of the windows that are compared, pixels."""
+WINDOWS_PX = (2.0, 6.0)
+"""Standard deviations of the windows that are compared, pixels."""
+SMEARED_PX = (0.02, 0.1)
+"""Standard deviation of the disparities within them beside a plane."""
 NUM_STEPS = 3
 MAX_STEP_PX = 0.5
 MAX_CHANGE_PX = 1.0
@@ -103,7 +105,10 @@ def _match(left: Gray, right: Gray, count: int) -> Plane:
 
 
 def refine(left: Gray, right: Gray, start: Plane, rows: Plane) -> tuple[Plane, Plane]:
-    """Gauss-Newton from a matcher's disparities.
+    """Gauss-Newton from a matcher's disparities, in small windows and in wide ones.
+
+    Both are averaged by the variances that their residuals and slopes predict: where
+    there is texture the small windows decide, elsewhere the wide ones.
 
     Args:
         left, right: (h, w) rectified.
@@ -114,30 +119,53 @@ def refine(left: Gray, right: Gray, start: Plane, rows: Plane) -> tuple[Plane, P
         Disparities (h, w), NaN where there are none or where the windows differ, and
         the correlation (h, w) of the windows.
     """
+    pair = left.astype(np.float32), right.astype(np.float32)
+    weight, total = np.zeros_like(start), np.zeros_like(start)
+    correlation = np.full_like(start, -1.0)
+    for window, blur_px in zip(WINDOWS_PX, SMEARED_PX, strict=True):
+        found = _refined(*pair, start, rows, window)
+        # What went astray, at a step in depth say, has no weight.
+        share = 1.0 / (found.variance + blur_px**2)
+        share[~(np.abs(found.disparity - start) < MAX_CHANGE_PX)] = 0.0
+        weight += share
+        total += share * np.nan_to_num(found.disparity)
+        np.maximum(correlation, found.correlation, out=correlation)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        disparity = np.where(weight > 0.0, total / weight, start)
+    disparity[correlation < MIN_CORRELATION] = np.nan
+    return disparity, correlation
+
+
+class _Refined(NamedTuple):
+    disparity: Plane
+    variance: Plane
+    correlation: Plane
+
+
+def _refined(
+    left: Plane, right: Plane, start: Plane, rows: Plane, window: float
+) -> _Refined:
     valid = np.isfinite(start)
     mask = valid.astype(np.float32)
-    disparity = smoothed(start, valid)
-    seen = left.astype(np.float32)
-    mean, contrast = _contrast(seen, mask)
-    target = (seen - mean) / contrast
+    disparity = smoothed(start, valid, window)
+    mean, contrast = _contrast(left, mask, window)
+    target = (left - mean) / contrast
     # cv2.Sobel's weights sum to eight pixels.
     gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    source = right.astype(np.float32)
+    # Pixels that a window averages, were their weights equal.
+    count = 4.0 * np.pi * window**2
     for _ in range(NUM_STEPS):
-        shown, slope = _warped((source, gradient), disparity, rows)
-        mean, contrast = _contrast(shown, mask)
+        shown, slope = _warped((right, gradient), disparity, rows)
+        mean, contrast = _contrast(shown, mask, window)
         slope *= mask / contrast
         error = target - (shown - mean) / contrast
-        step = _blur(slope * error) / np.maximum(_blur(slope * slope), 1e-6)
+        information = np.maximum(_blur(slope * slope, window), 1e-6)
+        step = _blur(slope * error, window) / information
         step = np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)
-        disparity = smoothed(np.where(valid, disparity - step, np.nan), valid)
-    (shown,) = _warped((source,), disparity, rows)
-    correlation, contrast = _correlation(seen, shown, mask)
-    # At a step in depth the window holds two surfaces; the matcher knew better.
-    astray = ~(np.abs(disparity - start) < MAX_CHANGE_PX)
-    disparity = np.where(astray, start, disparity)
-    disparity[(correlation < MIN_CORRELATION) | (contrast < MIN_CONTRAST)] = np.nan
-    return disparity, correlation
+        disparity = smoothed(np.where(valid, disparity - step, np.nan), valid, window)
+    variance = _blur(error * error * mask, window) / (count * information)
+    (shown,) = _warped((right,), disparity, rows)
+    return _Refined(disparity, variance, _correlation(left, shown, mask, window))
 
 
 def _warped(planes: tuple[Plane, ...], disparity: Plane, rows: Plane) -> list[Plane]:
@@ -153,27 +181,29 @@ def _warped(planes: tuple[Plane, ...], disparity: Plane, rows: Plane) -> list[Pl
     ]
 
 
-def _correlation(first: Plane, second: Plane, mask: Plane) -> tuple[Plane, Plane]:
-    """Of two planes in the windows, and the smaller contrast."""
-    share = np.maximum(_blur(mask), 1e-3)
-    means, contrasts = zip(*(_contrast(p, mask) for p in (first, second)), strict=True)
-    product = _blur(first * second * mask) / share - means[0] * means[1]
-    return product / (contrasts[0] * contrasts[1]), np.minimum(*contrasts)
+def _correlation(first: Plane, second: Plane, mask: Plane, window: float) -> Plane:
+    """Of two planes in windows."""
+    share = np.maximum(_blur(mask, window), 1e-3)
+    means, contrasts = zip(
+        *(_contrast(plane, mask, window) for plane in (first, second)), strict=True
+    )
+    product = _blur(first * second * mask, window) / share - means[0] * means[1]
+    return product / (contrasts[0] * contrasts[1])
 
 
-def _contrast(plane: Plane, mask: Plane) -> tuple[Plane, Plane]:
-    """Mean and standard deviation in the window."""
-    share = np.maximum(_blur(mask), 1e-3)
-    mean = _blur(plane * mask) / share
-    square = _blur(plane * plane * mask) / share
-    return mean, np.sqrt(np.maximum(square - mean * mean, 0.25))
+def _contrast(plane: Plane, mask: Plane, window: float) -> tuple[Plane, Plane]:
+    """Mean and standard deviation in windows, the latter at least `MIN_CONTRAST`."""
+    share = np.maximum(_blur(mask, window), 1e-3)
+    mean = _blur(plane * mask, window) / share
+    square = _blur(plane * plane * mask, window) / share
+    return mean, np.sqrt(np.maximum(square - mean * mean, MIN_CONTRAST**2))
 
 
-def _blur(plane: Plane) -> Plane:
-    return cv2.GaussianBlur(plane, (0, 0), WINDOW_PX, borderType=cv2.BORDER_REFLECT)
+def _blur(plane: Plane, window: float) -> Plane:
+    return cv2.GaussianBlur(plane, (0, 0), window, borderType=cv2.BORDER_REFLECT)
 
 
-def smoothed(disparity: Plane, valid: NDArray[np.bool_]) -> Plane:
+def smoothed(disparity: Plane, valid: NDArray[np.bool_], window: float) -> Plane:
     """Local planes through the valid disparities: exact on slants, also at a border."""
     height, width = disparity.shape
     mask = valid.astype(np.float32)
@@ -181,9 +211,9 @@ def smoothed(disparity: Plane, valid: NDArray[np.bool_]) -> Plane:
     d = np.where(valid, disparity, 0.0).astype(np.float32)
     # Moments about each pixel: those about the origin lose digits far from it, so take
     # them with kernels k, k x, k y, ... directly.
-    radius = int(np.ceil(3 * WINDOW_PX))
+    radius = int(np.ceil(3 * window))
     t = np.arange(-radius, radius + 1, dtype=np.float32)
-    k0 = np.exp(-0.5 * (t / WINDOW_PX) ** 2)
+    k0 = np.exp(-0.5 * (t / window) ** 2)
     k0 /= k0.sum()
     k1, k2 = k0 * t, k0 * t * t
 

@@ -39,7 +39,7 @@ from uwsfm.result_folder import Result, open_result
 from uwsfm.sfm.steps import fingerprint
 
 FOLDER, CLOUD, SUMMARY = "dense", "cloud.ply", "summary.json"
-FORMAT = 1
+FORMAT = 2
 PLACED_BYTES = 28
 """Per pixel of a depth map in memory, with its points."""
 _NOISE_VIEWS, _NOISE_NEIGHBOURS = 24, 3

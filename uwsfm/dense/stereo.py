@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows, sampled
-from uwsfm.dense.match import Gray, match_tiles, refine, smoothed
+from uwsfm.dense.match import WINDOWS_PX, Gray, match_tiles, refine, smoothed
 from uwsfm.dense.rectify import Rectification
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import closest_points
@@ -139,7 +139,7 @@ def _deviations(slab: Rectification, disparity: Plane) -> Plane:
     # Where a cell has no match its neighbours' serve.
     at = np.floor(np.minimum(uv, np.array(slab.size) - 1)).astype(int)
     valid = np.isfinite(disparity)
-    values = smoothed(disparity, valid)[at[:, 1], at[:, 0]]
+    values = smoothed(disparity, valid, WINDOWS_PX[-1])[at[:, 1], at[:, 0]]
     values = np.where(np.isfinite(values), values, np.nanmedian(disparity))
     xy, _ = slab.left_from_rect(uv)
     origins, dirs = slab.pair.left.ray_from_img(xy)
