@@ -40,7 +40,7 @@ def with_click_noise(lengths: Lengths, scene: Scene) -> Lengths:
     clicked[lengths.clicked] = True
     part, used = scene.select(clicked)
     information = np.zeros((part.num_points, 3, 3))
-    jac = _pixels_by_point(part)
+    jac = pixels_by_point(part)
     np.add.at(information, part.point_idx, np.swapaxes(jac, 1, 2) @ jac)
     spread = np.linalg.inv(information)
     ends = np.searchsorted(used, bars.ends)
@@ -77,7 +77,7 @@ def check_clicks(lengths: Lengths, scene: Scene) -> None:
                 )
 
 
-def _pixels_by_point(scene: Scene) -> Array:
+def pixels_by_point(scene: Scene) -> Array:
     """d(pixel) / d(point in the world), (N, 2, 3)."""
     jac = np.full((scene.num_observations, 2, 3), np.nan)
     in_cam = scene.points_in_cam()

@@ -219,42 +219,52 @@ def _shared_errors(
     """Cluster-robust covariance (B, B) of the border, priors included."""
     layout = optimum.layout
     covariance = clustered_covariance(
-        layout, optimum.state.kernel_state(), eqs, reduced, _clusters(optimum)
+        layout, optimum.state.kernel_state(), eqs, reduced, clusters_of(optimum)
     )
     # Residuals are smaller than errors by the share of fitted parameters.
     covariance *= 2 * len(layout.xy) / optimum.degrees_of_freedom
     if optimum.priors is not None:
-        prior = _prior_covariance(layout, optimum.state, optimum.priors, reduced)
+        prior = prior_covariance(
+            layout,
+            optimum.state,
+            optimum.priors,
+            reduced.coupling,
+            reduced.whole_border,
+        )
         covariance += optimum.sigma_px**2 * prior
     return covariance[: layout.num_camera_cols, : layout.num_camera_cols]
 
 
-def _prior_covariance(
-    layout: Layout, state: State, priors: Priors, reduced: ReducedCovariance
+def prior_covariance(
+    layout: Layout, state: State, priors: Priors, by_frame: Array, by_border: Array
 ) -> Array:
-    """What the errors of the priors do to the border (B, B): S^-1 K S^-1, with K what
+    """What the errors of the priors do to some numbers (K, K): S^-1 K S^-1, with K what
     they alone add to the reduced matrix.
 
     A length's own variance is the noise of its column.
+
+    Args:
+        layout, state, priors: of the optimum.
+        by_frame: (F, 6, K) of the free frames, and
+        by_border: (B, K) of the border: columns of S^-1.
     """
     eqs = empty_normal_equations(layout)
     priors.add_to(eqs, state, layout)
-    free = reduced.reduction.graph.frame
+    free = np.flatnonzero(layout.frame_col != HELD)
     num_unknown = layout.num_border_cols - layout.num_lengths
     border = eqs.border.copy()
     border[num_unknown:] *= -1.0
     border[num_unknown:, :num_unknown] = border[:num_unknown, num_unknown:] = 0.0
     coupling = eqs.frames_border[free]
     coupling[:, :, num_unknown:] = 0.0
-    by_frame, by_border = reduced.coupling, reduced.whole_border
     own = np.einsum(
         "fak,fab,fbm->km", by_frame, eqs.frames[free], by_frame, optimize=True
     )
     across = np.einsum("fak,fab->kb", by_frame, coupling) @ by_border
-    return own + across + across.T + by_border @ border @ by_border
+    return own + across + across.T + by_border.T @ border @ by_border
 
 
-def _clusters(optimum: Optimum) -> IndexArray:
+def clusters_of(optimum: Optimum) -> IndexArray:
     """Cluster (N,) of each sorted observation: its image, and the tile in it."""
     layout = optimum.layout
     frame = np.repeat(layout.cell_frame, np.diff(layout.cell_start))

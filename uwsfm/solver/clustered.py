@@ -28,7 +28,7 @@ from uwsfm.solver.state import KernelState
 
 @inner
 def _reach_of_point(layout, eqs, p, rows, out):
-    """What a pull (3,) on a point does to the border, (B, 3): S^-1 [W; E^T]."""
+    """What a pull (3,) on a point does to each row, (K, 3): S^-1 [W; E^T]."""
     offset = rows.shape[1] - len(eqs.border_grad)
     out[:] = 0.0
     for b in range(len(out)):
@@ -45,9 +45,8 @@ def _reach_of_point(layout, eqs, p, rows, out):
 
 
 @inner
-def _add_score(layout, rows, col, force, pull, grad, camera, of_point, score):
+def _add_score(layout, rows, offset, col, force, pull, grad, camera, of_point, score):
     """Add S^-1 J~^T r of one observation: its own part, minus what its point takes."""
-    offset = rows.shape[1] - len(score)
     for b in range(len(score)):
         total = -(
             of_point[b, 0] * pull[0]
@@ -64,8 +63,9 @@ def _add_score(layout, rows, col, force, pull, grad, camera, of_point, score):
 
 @kernel
 def _scores(layout, state, eqs, inverses, cluster, rows, out):
-    """Sum the border's part of S^-1 J~^T r of each cluster, (clusters, B); squared
-    loss. The frames' part would be as large as frames times clusters."""
+    """Sum some rows' part of S^-1 J~^T r of each cluster, (clusters, K); squared loss.
+    All rows' would be as large as frames times clusters."""
+    offset = rows.shape[1] - len(eqs.border_grad)
     j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
     j_border = np.zeros((2, BORDER_SIZE))
     force, grad = np.empty(6), np.empty(BORDER_SIZE)
@@ -102,6 +102,7 @@ def _scores(layout, state, eqs, inverses, cluster, rows, out):
                 _add_score(
                     layout,
                     rows,
+                    offset,
                     layout.frame_col[f],
                     force,
                     pull,
@@ -127,6 +128,26 @@ def clustered_covariance(
         cluster: (N,) cluster of each sorted observation, counted from 0.
     """
     rows = reduced.border_rows
-    scores = np.zeros((int(cluster.max()) + 1, len(rows)))
-    _scores(layout, state, eqs, reduced.points, cluster, rows, scores)
+    scores = cluster_scores(layout, state, eqs, reduced, cluster, rows)
     return scores.T @ scores
+
+
+def cluster_scores(
+    layout: Layout,
+    state: KernelState,
+    eqs: NormalEquations,
+    reduced: ReducedCovariance,
+    cluster: IndexArray,
+    rows: Array,
+) -> Array:
+    """What the residuals of each cluster do to some numbers (clusters, K).
+
+    Args:
+        layout, state, eqs, reduced, cluster: as of `clustered_covariance`.
+        rows: (K, n) derivatives of the numbers by the unknowns of the reduced system,
+            times S^-1.
+    """
+    scores = np.zeros((int(cluster.max()) + 1, len(rows)))
+    rows = np.ascontiguousarray(rows)
+    _scores(layout, state, eqs, reduced.points, cluster, rows, scores)
+    return scores

@@ -1,0 +1,1 @@
+"""Distances, areas, heights and angles in a finished model, with deviations."""
