@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from uwsfm.export.refractive_colmap import export_refractive_colmap
     from uwsfm.export.scene_ply import export_scene_ply
     from uwsfm.housing_pipeline import calibrate_housing
+    from uwsfm.measuring.measure import measure
     from uwsfm.models.port import DomePort, FlatPort, NoPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
@@ -80,6 +81,7 @@ _HOMES = {
     "export_refractive_colmap": "uwsfm.export.refractive_colmap",
     "export_scene_ply": "uwsfm.export.scene_ply",
     "load_rig": "uwsfm.rig_file",
+    "measure": "uwsfm.measuring.measure",
     "read_cloud": "uwsfm.cloud",
     "read_model": "uwsfm.export.files",
     "read_refractive_colmap": "uwsfm.sfm.refractive_colmap",
@@ -122,6 +124,7 @@ __all__ = [
     "export_refractive_colmap",
     "export_scene_ply",
     "load_rig",
+    "measure",
     "open_result",
     "perspective_adjustment",
     "predict_covariance",

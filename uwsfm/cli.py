@@ -14,6 +14,7 @@ import typer
 from uwsfm.cli_batch import batch
 from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
+from uwsfm.cli_measure import measure
 from uwsfm.cli_options import (
     LengthsOption,
     LeverArmOption,
@@ -46,6 +47,7 @@ app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
 app.command()(dense)
+app.command()(measure)
 app.command()(clean)
 app.command()(color)
 app.command("map")(map_)

@@ -100,11 +100,11 @@ class KnownLengths:
                         f"{self.source}: frame_distances[{i}].frames: {name!r} is not "
                         f"among the images, whose names are like {frame_names[0]!r}"
                     )
-        images = _image_index(rig, frame_names)
+        images = image_index(rig, frame_names)
         for i, bar in enumerate(self.file.scale_bars):
             for j, clicks in enumerate(bar.ends):
                 for click in clicks:
-                    _check_click(
+                    check_click(
                         f"{self.source}: scale_bars[{i}].ends[{j}]", click, images, rig
                     )
 
@@ -134,7 +134,7 @@ class KnownLengths:
             lengths = replace(lengths, between_frames=known)
         if self.file is not None and self.file.scale_bars:
             ends = _Ends(self.source, self.file.scale_bars)
-            scene, lengths = ends.placed(scene, lengths, _image_index(rig, frame_names))
+            scene, lengths = ends.placed(scene, lengths, image_index(rig, frame_names))
         return scene, lengths
 
     def _positions(self, table: PositionTable, index: dict[str, int]) -> Positions:
@@ -181,7 +181,7 @@ class KnownLengths:
         )
 
 
-def _image_index(rig: Rig, frame_names: Sequence[str]) -> dict[str, tuple[int, int]]:
+def image_index(rig: Rig, frame_names: Sequence[str]) -> dict[str, tuple[int, int]]:
     """(camera, frame) of each image by its name, "folder/file"."""
     return {
         str(PurePosixPath(camera.images) / name): (c, f)
@@ -190,7 +190,7 @@ def _image_index(rig: Rig, frame_names: Sequence[str]) -> dict[str, tuple[int, i
     }
 
 
-def _check_click(
+def check_click(
     where: str, click: Click, images: dict[str, tuple[int, int]], rig: Rig
 ) -> None:
     if click.image not in images:

@@ -1,0 +1,94 @@
+"""`uwsfm measure`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from uwsfm.errors import InputError
+
+_PICK = (
+    "a point id (1234), a place of a cloud (0.1,-0.4,1.9), or pixels "
+    "(left/01.png:412.5,300+right/01.png:380,311)"
+)
+
+
+def measure(
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
+    ],
+    measurements: Annotated[
+        Path | None,
+        typer.Argument(
+            help="measurements.yaml: distances, polylines, areas, heights, angles and "
+            "scale bars, see the README.",
+            show_default=False,
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="PICK", help=f"One end: {_PICK}.", show_default=False
+        ),
+    ] = None,
+    end: Annotated[
+        str | None,
+        typer.Option("--to", metavar="PICK", help="The other.", show_default=False),
+    ] = None,
+    known: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="How long it is known to be: a scale bar, to check.",
+            show_default=False,
+        ),
+    ] = None,
+    click_stddev: Annotated[
+        float | None,
+        typer.Option(metavar="PX", help="Noise of clicked pixels.", show_default=False),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="JSON file to write.", show_default=False),
+    ] = None,
+) -> None:
+    """Measure in a result: lengths, areas, angles, with their standard deviations."""
+    from rich.markup import escape
+
+    from uwsfm.console import console
+    from uwsfm.measuring.measure import measure as run
+    from uwsfm.measuring.table import measurement_table
+
+    what: Path | dict[str, Any]
+    if measurements is not None:
+        if start or end or known is not None or click_stddev is not None:
+            raise InputError(
+                f"{measurements} says what to measure: --from, --to, --known and "
+                "--click-stddev are for a single distance"
+            )
+        what = measurements
+    else:
+        what = _single(start, end, known, click_stddev)
+    found = run(out, what, report)
+    console.print(measurement_table(found))
+    for warning in found.warnings:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    if report is not None:
+        typer.echo(f"wrote {report}")
+
+
+def _single(
+    start: str | None, end: str | None, known: float | None, click_stddev: float | None
+) -> dict[str, Any]:
+    """The measurements.yaml of one distance."""
+    if not start or not end:
+        raise InputError(
+            "name what to measure: a measurements.yaml, or --from and --to"
+        )
+    item: dict[str, Any] = {"name": "distance", "ends": [start, end]}
+    content: dict[str, Any] = {"version": 1}
+    if click_stddev is not None:
+        content["click_stddev_px"] = click_stddev
+    if known is None:
+        return {**content, "distances": [item]}
+    return {**content, "scale_bars": [{**item, "length_m": known}]}

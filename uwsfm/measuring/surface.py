@@ -1,0 +1,199 @@
+"""The surface that a model or a dense cloud knows, where people point at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uwsfm.cloud import read_cloud
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.result_folder import Result
+from uwsfm.scene import IndexArray, Scene
+
+DENSE_CLOUD = Path("dense") / "cloud.ply"
+
+NEIGHBOURS = 12
+"""Points that tell the surface below a pixel."""
+MAX_REACH = 0.03
+"""Of the image's width: points farther from the pixel tell nothing of its surface."""
+DEPTH_STEP = 0.05
+"""Points that differ more in range are on something else."""
+AWAY = 5.0
+"""Times the spacing of the points around: farther, a place is none of the cloud's."""
+WITNESSES = 10
+"""Points of the model around a place: what saw them sees the place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points on surfaces (P, 3), where they come from, and what is known of each."""
+
+    points: Array
+    name: str
+    stddev: Array | None = None
+    """(P,) along the line of sight, metres; None: points of the model."""
+    width: int = field(default=NEIGHBOURS)
+
+    @property
+    def is_model(self) -> bool:
+        return self.stddev is None
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.points)
+
+    def nearest(self, xyz: Array) -> int:
+        """Index of the point that a place means.
+
+        Raises:
+            InputError: the place is not on the cloud.
+        """
+        gaps, rows = self.tree.query(xyz, k=min(self.width, len(self.points)))
+        spacing = float(np.median(self.tree.query(self.points[rows], k=2)[0][:, 1]))
+        if not gaps[0] <= AWAY * spacing:
+            raise InputError(
+                f"the nearest point of {self.name} is {gaps[0]:.3g} m away, the points "
+                f"there {spacing:.2g} m from each other: copy the place from the cloud"
+            )
+        return int(rows[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The surface where the ray of a pixel meets it."""
+
+    point: Array
+    """(3,) in the world."""
+    normal: Array
+    """(3,) of the plane through the points around."""
+    sight: Array
+    """(3,) unit, direction of the ray."""
+    relief: float
+    """RMS distance of these points from the plane, along the ray, metres."""
+    reach_px: float
+    """How far the points are from the pixel at most."""
+    stddev: float
+    """That the cloud states along the line of sight; NaN if it does not."""
+
+
+def surface_of(result: Result) -> Surface:
+    """The dense cloud of a result; else the points of its model.
+
+    Raises:
+        InputError: the cloud cannot be read.
+    """
+    path = result.folder / DENSE_CLOUD
+    if path.is_file():
+        cloud = read_cloud(path)
+        if len(cloud) < NEIGHBOURS:
+            raise InputError(f"{path} has {len(cloud)} points only")
+        return Surface(cloud.points, str(DENSE_CLOUD), cloud.stddev)
+    return model_surface(result.model.scene)
+
+
+def model_surface(scene: Scene) -> Surface:
+    """The points of a model."""
+    return Surface(scene.points, "the sparse model")
+
+
+def patch_below(
+    surface: Surface, scene: Scene, camera: int, frame: int, xy: tuple[float, float]
+) -> Patch:
+    """Where the ray of a pixel meets the surface.
+
+    Raises:
+        InputError: there is no surface there, or its depth jumps.
+    """
+    lens = scene.cameras[camera]
+    pose = rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world[frame])
+    in_cam = rigid3.transform(pose, surface.points)
+    pixels, valid = lens.img_from_point(in_cam)
+    gaps = np.where(valid, np.linalg.norm(pixels - xy, axis=1), np.inf)
+    rows = np.argsort(gaps)[:NEIGHBOURS]
+    limit = MAX_REACH * lens.width
+    if not gaps[rows[-1]] <= limit:
+        count = int(np.count_nonzero(gaps <= limit))
+        raise InputError(
+            f"{surface.name} has {count} points within {limit:.0f} px of the pixel, "
+            f"its surface takes {NEIGHBOURS}: click the spot in a second image"
+        )
+    ranges = np.linalg.norm(in_cam[rows], axis=1)
+    if np.any(np.abs(ranges / np.median(ranges) - 1.0) > DEPTH_STEP):
+        raise InputError(
+            f"the depth jumps there, from {ranges.min():.3g} to {ranges.max():.3g} m "
+            "around the pixel: click the spot in a second image"
+        )
+    near = surface.points[rows]
+    origin, sight = _ray_in_world(lens, pose, xy)
+    middle = near.mean(axis=0)
+    normal = np.linalg.svd(near - middle)[2][2]
+    facing = float(normal @ sight)
+    off = (near - middle) @ normal / facing if facing else np.full(len(near), np.inf)
+    stated = (
+        np.nan if surface.stddev is None else float(np.median(surface.stddev[rows]))
+    )
+    # With points nearly on a line the plane may hold the ray: the middle's depth then.
+    if not np.all(np.abs(off) < DEPTH_STEP * ranges):
+        raise InputError(
+            "the surface is seen edge-on there: click the spot in a second image"
+        )
+    along = float(normal @ (middle - origin)) / facing
+    return Patch(
+        point=origin + along * sight,
+        normal=normal,
+        sight=sight,
+        relief=float(np.sqrt(np.mean(off**2))),
+        reach_px=float(gaps[rows[-1]]),
+        stddev=stated,
+    )
+
+
+def _ray_in_world(lens, pose: Array, xy: tuple[float, float]) -> tuple[Array, Array]:
+    """Origin and direction (3,) of a pixel's water ray in the world."""
+    origin, direction = lens.ray_from_img([xy])
+    back = rigid3.inverse(pose)
+    world = rigid3.transform(back, origin)[0], rigid3.rotate(back, direction)[0]
+    if not np.all(np.isfinite(world)):
+        raise InputError("no ray in the water belongs to this pixel")
+    return world
+
+
+def views_of(
+    scene: Scene, model: Surface, point: Array
+) -> tuple[IndexArray, IndexArray, Array]:
+    """Images that see a place: those that saw the model's points around it.
+
+    Args:
+        scene: of the model.
+        model: its points.
+        point: (3,) in the world.
+
+    Returns:
+        camera_idx, frame_idx (k,) and pixels (k, 2), inside of the images.
+    """
+    near = np.atleast_1d(model.tree.query(point, k=min(WITNESSES, scene.num_points))[1])
+    rows = np.isin(scene.point_idx, near)
+    images = np.unique(
+        np.stack([scene.camera_idx[rows], scene.frame_idx[rows]], axis=1), axis=0
+    )
+    seen = Scene(
+        cameras=scene.cameras,
+        cam_from_rig=scene.cam_from_rig,
+        rig_from_world=scene.rig_from_world,
+        points=point[None],
+        camera_idx=images[:, 0],
+        frame_idx=images[:, 1],
+        point_idx=np.zeros(len(images), dtype=np.int64),
+        xy=np.zeros((len(images), 2)),
+    )
+    pixels, valid = seen.projections()
+    sizes = np.array([(lens.width, lens.height) for lens in scene.cameras])
+    size = sizes[images[:, 0]]
+    inside = valid & np.all((pixels >= 0.0) & (pixels <= size), axis=1)
+    return images[inside, 0], images[inside, 1], pixels[inside]
