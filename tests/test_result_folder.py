@@ -91,7 +91,7 @@ def _without_model(out):
     ("harm", "words"),
     [
         (_without_calibration, "calibration.npz is missing: an earlier version"),
-        (_cut_short, "calibration.npz is damaged: run the command"),
+        (_cut_short, "calibration.npz is damaged, or of another version"),
         (_of_another_run, "is of another model than the one beside it"),
         (_of_another_format, "has format 9, this version of uwsfm reads 1"),
         (_of_another_size, "calibration.npz is damaged"),

@@ -153,7 +153,7 @@ _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) + (
 
 
 def _damaged(path: Path) -> InputError:
-    return InputError(f"{path} is damaged: {RUN_AGAIN}")
+    return InputError(f"{path} is damaged, or of another version of uwsfm: {RUN_AGAIN}")
 
 
 def _calibration(
