@@ -17,6 +17,8 @@ from uwsfm.geometry import rigid3
 from uwsfm.pipeline import reconstruct
 from uwsfm.report.command import command_line
 from uwsfm.report.files import FOLDER, NUMBERS, PAGE, write_with_report
+from uwsfm.report.gather import gather
+from uwsfm.report.page import page_of
 from uwsfm.report.tables import frame_stddevs
 from uwsfm.report.view import MAX_POINTS, view_of
 from uwsfm.report.words import deviation, rounded, verdict_of
@@ -189,3 +191,18 @@ def test_far_worlds_keep_their_digits(dive_result):
     as_drawn = there.points.astype(np.float32) + (there.origin - away)
     # Half a unit in the last place of 32 bits, for coordinates of a few metres.
     np.testing.assert_allclose(as_drawn, here.points, atol=1e-6)
+
+
+def test_what_other_commands_left_is_named(dive_result, tmp_path):
+    result = dive_result.result
+    (tmp_path / "dense").mkdir()
+    for name in ("points.ply", "dense/cloud.ply", "my reef.glb", "measured.json"):
+        (tmp_path / name).write_bytes(b"")
+    covariance = result.calibration.covariance
+    report = gather(result.model, covariance, result.summary, tmp_path)
+    assert [path for path, _ in report.other_files] == [
+        "dense/cloud.ply",
+        "my reef.glb",
+        "measured.json",
+    ]
+    assert '<a href="my%20reef.glb">my reef.glb</a>' in page_of(report)

@@ -12,10 +12,8 @@ from uwsfm.colmap import Model
 from uwsfm.errors import InputError
 from uwsfm.export.files import SUMMARY
 from uwsfm.export.summary import write_json
-from uwsfm.report.gather import gather, numbers_of
+from uwsfm.report.gather import FOLDER, NUMBERS, PAGE, gather, numbers_of
 from uwsfm.result_folder import open_result
-
-PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"
 
 
 def write_report(out: str | Path) -> Path:

@@ -10,20 +10,24 @@ import numpy as np
 
 from uwsfm.calibration.problem import Covariance
 from uwsfm.colmap import Model
+from uwsfm.export.files import POINTS, SPARSE, WORK
 from uwsfm.report.residuals import FEWEST, CameraResiduals, camera_residuals
 from uwsfm.report.tables import Estimate, Frame, estimates, frames
 from uwsfm.report.view import View, view_of
-from uwsfm.report.words import Verdict, small_unit_of, unit_of, verdict_of
+from uwsfm.report.words import Verdict, small_lengths, unit_of, verdict_of
 
-OTHER_FILES = (
-    ("dense.ply", "dense cloud"),
-    ("mesh.ply", "mesh"),
-    ("mesh.glb", "mesh for the web"),
-    ("orthophoto.tif", "orthophoto"),
-    ("height.tif", "height map"),
-    ("measurements.json", "measurements"),
-)
-"""What other commands may have left in the output folder."""
+PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"
+OTHER_FILES = {
+    ".ply": "cloud or mesh",
+    ".las": "cloud",
+    ".laz": "cloud",
+    ".obj": "mesh",
+    ".glb": "mesh for the web",
+    ".tif": "map",
+}
+"""What other commands may have left in the output folder or in folders in it."""
+_OWN = {SPARSE, POINTS, FOLDER, WORK}
+MEASURED = "measure*.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +52,9 @@ class Report:
     unit: str
     """Of lengths: "m" or "units"."""
     small_unit: str
-    """Of lengths times 1000."""
+    """Of small lengths: "mm", or "units" as well."""
+    small_scale: float
+    """How many of it a unit is."""
     verdict: Verdict
     estimates: tuple[Estimate, ...]
     view: View
@@ -73,10 +79,12 @@ def gather(
     """
     names = [camera.name for camera in model.rig.cameras]
     residuals = tuple(camera_residuals(model.scene, names))
+    small_unit, small_scale = small_lengths(summary)
     return Report(
-        title=out.resolve().name,
+        title="/".join(out.resolve().parts[-2:]),
         unit=unit_of(summary),
-        small_unit=small_unit_of(summary),
+        small_unit=small_unit,
+        small_scale=small_scale,
         verdict=verdict_of(summary),
         estimates=estimates(summary),
         view=view_of(model, covariance),
@@ -84,9 +92,20 @@ def gather(
         coverage=tuple(_coverage(model, names.index(r.name), r) for r in residuals),
         frames=frames(model, covariance),
         summary=summary,
-        other_files=tuple(
-            (path, what) for path, what in OTHER_FILES if (out / path).is_file()
-        ),
+        other_files=_other_files(out),
+    )
+
+
+def _other_files(out: Path) -> tuple[tuple[str, str], ...]:
+    found = [
+        (path, OTHER_FILES[path.suffix])
+        for path in sorted([*out.glob("*.*"), *out.glob("*/*.*")])
+        if path.suffix in OTHER_FILES and path.is_file()
+    ]
+    found += [(path, "measurements") for path in sorted(out.glob(MEASURED))]
+    places = [(path.relative_to(out), what) for path, what in found]
+    return tuple(
+        (path.as_posix(), what) for path, what in places if path.parts[0] not in _OWN
     )
 
 

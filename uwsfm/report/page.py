@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from uwsfm.report.gather import Report, plain
 from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
-from uwsfm.report.view import View
 from uwsfm.report.words import deviation
 
 _BADGES = {
@@ -24,6 +23,8 @@ _BADGES = {
     "arbitrary": "bad",
     "ran into zero": "bad",
 }
+NOTICEABLE_PX = 0.03
+"""Of systematic residuals: what feature detectors may do by themselves."""
 _SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
 """A shape beside the word: colour alone tells nothing to many."""
 
@@ -60,6 +61,7 @@ def page_of(report: Report) -> str:
         summary=summary,
         written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
+        systematic=_systematic_words(report),
         view_caption=_view_caption(report),
         residual_words=[_residual_words(camera, report) for camera in report.residuals],
         pinhole_models=_pinhole_models(report),
@@ -163,7 +165,30 @@ def _residual_words(camera: CameraResiduals, report: Report) -> str:
             f"depth, is off by {rms:.2g} px RMS and up to {most:.2g} px at the 10th "
             "and 90th percentile of depth."
         )
+    if ours.systematic_px > max(theirs.systematic_px, NOTICEABLE_PX):
+        text += (
+            " That the pinhole leaves less of it here is no merit of a single centre: "
+            f"its lens was fitted to these very observations, and {_our_lens(report)}"
+        )
     return text
+
+
+def _our_lens(report: Report) -> str:
+    refined = " ".join(row["name"] for row in report.summary["refined"])
+    if "fx of" in refined or "f of" in refined:
+        return "uwsfm refined its own with everything else."
+    return (
+        "uwsfm holds that of the calibration in air. Most likely that calibration is a "
+        "little wrong: --refine focal, principal-point and distortion tell."
+    )
+
+
+def _systematic_words(report: Report) -> str:
+    parts = [
+        f"{_systematic(camera.refractive.systematic_px)} ({camera.name})"
+        for camera in report.residuals
+    ]
+    return f"Of it, {', '.join(parts)} is systematic by place in the image and depth."
 
 
 def _systematic(value: float) -> str:
@@ -187,7 +212,7 @@ def _frame_rows(report: Report) -> list[_Row]:
         for error in (frame.mean_error_px, frame.rms_error_px):
             cells.append((f"{error:.6g}", f"{error:.3f}"))
         for value, scale in (
-            (frame.position_stddev_m, 1e3),
+            (frame.position_stddev_m, report.small_scale),
             (frame.rotation_stddev_deg, 1.0),
         ):
             known = math.isfinite(value)
@@ -207,11 +232,12 @@ def _payload(report: Report, scales: list[Scales]) -> dict[str, Any]:
         "solves": report.summary["solves"],
         "residuals": plain(report.residuals),
         "scales": plain(scales),
-        "view": _view_payload(report.view, [frame.name for frame in report.frames]),
+        "view": _view_payload(report),
     }
 
 
-def _view_payload(view: View, names: list[str]) -> dict[str, Any]:
+def _view_payload(report: Report) -> dict[str, Any]:
+    view, stddev = report.view, report.small_scale * report.view.stddev_m
     places = np.concatenate([view.points, view.trajectory, *view.frusta])
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
     room = 0.03 * max(float((high - low).max()), 1e-6)
@@ -223,14 +249,11 @@ def _view_payload(view: View, names: list[str]) -> dict[str, Any]:
         "points": _packed(view.points),
         "colors": base64.b64encode(view.colors.tobytes()).decode("ascii"),
         "error": _packed(view.error_px),
-        "stddev": _packed(1e3 * view.stddev_m),
-        "limits": {
-            "error": _limits(view.error_px),
-            "stddev": _limits(1e3 * view.stddev_m),
-        },
+        "stddev": _packed(stddev),
+        "limits": {"error": _limits(view.error_px), "stddev": _limits(stddev)},
         "frusta": [_packed(lines) for lines in view.frusta],
         "trajectory": _packed(view.trajectory),
-        "names": names,
+        "names": [frame.name for frame in report.frames],
         "sight": view.sight.tolist(),
         "up": view.up.tolist(),
         "ranges": np.stack([low, high], axis=1).tolist(),

@@ -14,7 +14,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.report.words import (
     deviation,
     rounded,
-    small_unit_of,
+    small_lengths,
     tilts_deg,
 )
 from uwsfm.scene import IndexArray
@@ -61,12 +61,12 @@ def estimates(summary: dict[str, Any]) -> tuple[Estimate, ...]:
 
 
 def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
-    unit, group = small_unit_of(summary), camera["name"]
+    (unit, scale), group = small_lengths(summary), camera["name"]
     if camera["port"] == "none":
         return [_row(group, "port", "none", "", "", "given")]
     if camera["port"] == "dome":
         rows = [
-            _number(group, f"dome centre {axis}", value, stddev, unit, word, 1e3)
+            _number(group, f"dome centre {axis}", value, stddev, unit, word, scale)
             for axis, value, stddev, word in zip(
                 "xyz",
                 camera["center_m"],
@@ -84,7 +84,9 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
         ]
         distance, stddev = camera["distance_m"], camera["distance_stddev_m"]
         word = camera["distance_verdict"]
-        rows.append(_number(group, "port distance", distance, stddev, unit, word, 1e3))
+        rows.append(
+            _number(group, "port distance", distance, stddev, unit, word, scale)
+        )
     rows.append(_given(group, "glass thickness", 1e3 * camera["thickness_m"], "mm"))
     rows.append(_given(group, "glass index", camera["glass_index"], ""))
     if not any(row["name"].startswith("water index") for row in summary["refined"]):
@@ -94,7 +96,7 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
 
 def _placement(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     pose, group = camera["cam_from_rig"], camera["name"]
-    unit, turn_stddev = small_unit_of(summary), pose["rotation_stddev_deg"]
+    (unit, scale), turn_stddev = small_lengths(summary), pose["rotation_stddev_deg"]
     turn = np.degrees(rigid3.rotvec_from_quat(pose["rotation_xyzw"])).tolist()
     rows = [
         _number(group, f"cam_from_rig turn {axis}", value, turn_stddev, "deg")
@@ -102,7 +104,7 @@ def _placement(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate
     ]
     place = pose["translation_m"], pose["translation_stddev_m"]
     rows += [
-        _number(group, f"cam_from_rig shift {axis}", value, stddev, unit, scale=1e3)
+        _number(group, f"cam_from_rig shift {axis}", value, stddev, unit, scale=scale)
         for axis, value, stddev in zip("xyz", *place, strict=True)
     ]
     return rows

@@ -19,9 +19,9 @@ MAX_FRUSTA = 200
 """Per camera; of more frames every so many-th is drawn, and the whole trajectory."""
 FRUSTUM_SHARE = 0.12
 """Length of a frustum, as a share of the median distance of the points."""
-OUTLYING = 1.5
-"""Points further out than so many times the span of the 1st to 99th percentile would
-shrink the rest to a dot."""
+OUTLYING = 0.8
+"""Points further from the middle than so many times the span of the 1st to the 99th
+percentile would shrink the rest to a dot."""
 _FAR_ORIGIN = 1e3
 """Spans: coordinates so much larger lose digits as 32-bit numbers."""
 

@@ -12,10 +12,9 @@ class Verdict:
     """What a reader needs first."""
 
     metric: str
-    """Whether lengths are metres, one or two sentences."""
+    """Whether lengths are metres, some sentences."""
     metric_word: str
     """"determined", "weakly determined", "not determined" or "arbitrary"."""
-    frames: str
     fit: str
     ports: tuple["PortVerdict", ...]
     open: tuple[str, ...]
@@ -37,23 +36,20 @@ def verdict_of(summary: dict[str, Any]) -> Verdict:
     rms = summary["reprojection_rms_px"]
     registered, frames = summary["num_registered_frames"], summary["num_frames"]
     points, count = summary["num_points"], summary["num_observations"]
-    before = rms["before"]
     return Verdict(
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
-        frames=f"{registered} of {frames} frames are registered, with {points} points "
-        f"seen in {count} observations.",
-        fit=f"The true reprojection error is {rms['after']:.3g} px RMS"
-        + ("" if before is None else f", before the adjustment {before:.3g} px")
-        + ".",
+        fit=f"{registered} of {frames} frames are registered, with {points} points "
+        f"seen in {count} observations. The true reprojection error is "
+        f"{rms['after']:.3g} px RMS, before the adjustment {rms['before']:.3g} px.",
         ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
         open=tuple(_sentence(text) for text in summary["warnings"]),
     )
 
 
-def small_unit_of(summary: dict[str, Any]) -> str:
-    """What 1e-3 of a length is called, short enough for a table."""
-    return "1e-3 units" if unit_of(summary) == "units" else "mm"
+def small_lengths(summary: dict[str, Any]) -> tuple[str, float]:
+    """The unit of small lengths, and how many of it a unit of the model is."""
+    return ("units", 1.0) if unit_of(summary) == "units" else ("mm", 1e3)
 
 
 def unit_of(summary: dict[str, Any]) -> str:
@@ -83,9 +79,8 @@ def _decimals(stddev: float) -> int:
     return min(max(1 - math.floor(math.log10(stddev)), 0), 9)
 
 
-def with_deviation(
-    value: float, stddev: float | None, unit: str, scale: float = 1.0
-) -> str:
+def with_deviation(value: float, stddev: float | None, unit: str, scale: float) -> str:
+    """An estimate in a sentence."""
     known = "" if stddev is None else f" ± {deviation(stddev, scale)}"
     return f"{rounded(value, stddev, scale)}{known} {unit}"
 
@@ -137,12 +132,12 @@ def _source(summary: dict[str, Any]) -> str:
 
 
 def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
-    name, unit = camera["name"], small_unit_of(summary)
+    name, small = camera["name"], small_lengths(summary)
     if camera["port"] == "none":
         return PortVerdict(camera=name, text="no port", words=())
     if camera["port"] == "dome":
         parts = zip(camera["center_m"], camera["center_stddev_m"], strict=True)
-        center = ", ".join(with_deviation(v, s, unit, 1e3) for v, s in parts)
+        center = ", ".join(with_deviation(v, s, *small) for v, s in parts)
         return PortVerdict(
             camera=name,
             text=f"dome, its centre at {center} from the projection centre",
@@ -151,9 +146,7 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
     stddev = camera["normal_stddev_deg"]
     tilt = ", ".join(rounded(value, stddev) for value in tilts_deg(camera["normal"]))
     known = "" if stddev is None else f" ± {deviation(stddev)}"
-    distance = with_deviation(
-        camera["distance_m"], camera["distance_stddev_m"], unit, 1e3
-    )
+    distance = with_deviation(camera["distance_m"], camera["distance_stddev_m"], *small)
     return PortVerdict(
         camera=name,
         text=f"flat port, its normal tilted by {tilt}{known} deg towards x and y, at "

@@ -164,6 +164,7 @@
   });
 
   // The scene.
+  const element = document.getElementById("cloud");
   const view = data.view, points = columns(view.points);
   const trajectory = columns(view.trajectory), frusta = view.frusta.map(columns);
   const rgb = bytes(view.colors), hex = (v) => v.toString(16).padStart(2, "0");
@@ -184,8 +185,8 @@
       const a = (k + 1) % 3, b = (k + 2) % 3;
       return view.sight[a] * view.up[b] - view.sight[b] * view.up[a];
     });
-    const away = [0, 1, 2].map((k) => -view.sight[k] + 0.55 * view.up[k] + 0.4 * side[k]);
-    const length = Math.hypot(...away), far = 1.45;
+    const away = [0, 1, 2].map((k) => -view.sight[k] + 0.8 * view.up[k] + 0.5 * side[k]);
+    const length = Math.hypot(...away), far = element.clientWidth < 600 ? 1.7 : 1.4;
     const eye = away.map((v, k) => view.middle[k] + v * far / length);
     return { eye: xyz(eye), up: xyz(view.up), center: xyz(view.middle) };
   }
@@ -201,9 +202,8 @@
   function shown(name) {
     return !state.hidden.has(name);
   }
-  const element = document.getElementById("scene");
   let camera = firstCamera();
-  figure("scene", (color) => {
+  figure("cloud", (color) => {
     const traces = [{
       type: "scatter3d", mode: "markers", ...xyz(points), marker: marker(color), hoverinfo: "skip",
       visible: shown("points"),
@@ -214,7 +214,7 @@
     }));
     traces.push({
       type: "scatter3d", mode: "lines+markers", ...xyz(trajectory), text: view.names,
-      line: { color: color("--ink"), width: 2 }, marker: { size: 2.5, color: color("--ink") },
+      line: { color: color("--ink"), width: 1 }, marker: { size: 2.5, color: color("--ink") },
       hovertemplate: "%{text}<extra></extra>", visible: shown("trajectory"),
     });
     const side = (name, k) => ({
