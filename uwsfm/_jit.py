@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from filelock import FileLock
 from numba.core import config
+from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
 
 Function = TypeVar("Function", bound=Callable)
@@ -62,21 +64,34 @@ if CACHE_DIR is not None:
 
 
 _OPTIONS: dict[str, Any] = {
-    "cache": CACHE_DIR is not None,
     "nogil": True,
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
 }
-# What is called by kernels alone needs no entrance from Python, which is a fifth of
-# what there is to compile.
-_INNER = {**_OPTIONS, "no_cpython_wrapper": True}
 
 # What SIMD needs and no more: sums may be regrouped, NaN stays NaN.
 _LANE_MATH = {"nsz", "arcp", "contract", "reassoc"}
 
 
-class _InnerDispatcher(CPUDispatcher):
-    """A kernel without an entrance from Python: to call that would end the process.
+class _SharedCache(FunctionCache):
+    """Numba's, for processes that compile a kernel for other arguments at a time.
+
+    It reads an index, adds a line and writes it: one of them would lose its own.
+    """
+
+    def save_overload(self, *args: Any) -> None:
+        with FileLock(f"{config.CACHE_DIR}/saving.lock"):  # type: ignore[attr-defined]
+            super().save_overload(*args)
+
+
+class _Dispatcher(CPUDispatcher):
+    def enable_caching(self) -> None:
+        self._cache = _SharedCache(self.py_func)
+
+
+class _InnerDispatcher(_Dispatcher):
+    """A kernel without an entrance from Python, a sixth of what there is to compile: to
+    enter there would end the process.
 
     Called from Python all the same, in tests say, it is compiled with one, for this
     process alone: in the cache both would have the same name.
@@ -91,24 +106,22 @@ class _InnerDispatcher(CPUDispatcher):
 
 def kernel(function: Function) -> Function:
     """Compile with numba: releases the GIL, IEEE division, cached on disk."""
-    compiled: Any = numba.njit(**_OPTIONS)
-    return compiled(function)
+    return _compiled(function, _Dispatcher)
 
 
 def inner(function: Function) -> Function:
     """Compile a kernel that only kernels call."""
-    return _inner(function, **_INNER)
+    return _compiled(function, _InnerDispatcher)
 
 
 def fused(function: Function) -> Function:
     """Compile a kernel whose sums may be regrouped, as those of lanes are."""
-    compiled: Any = numba.njit(**_OPTIONS, fastmath=_LANE_MATH)
-    return compiled(function)
+    return _compiled(function, _Dispatcher, fastmath=_LANE_MATH)
 
 
 def inner_fused(function: Function) -> Function:
     """Compile a kernel that only kernels call, and whose sums may be regrouped."""
-    return _inner(function, **_INNER, fastmath=_LANE_MATH)
+    return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH)
 
 
 def lane(function: Function) -> Function:
@@ -117,11 +130,14 @@ def lane(function: Function) -> Function:
     It becomes part of its caller, else the caller's loop would not vectorise: keep it
     free of branches (min, max, `x if ok else y`), inner loops and arrays of any length.
     """
-    return _inner(function, **_INNER, fastmath=_LANE_MATH, forceinline=True)
+    return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH, forceinline=True)
 
 
-def _inner(function: Function, **options: Any) -> Function:
-    compiled: Any = numba.njit(**options)(function)
-    if isinstance(compiled, CPUDispatcher):  # not where compilation is turned off
-        compiled.__class__ = _InnerDispatcher
-    return compiled
+def _compiled(function: Function, dispatcher: type[_Dispatcher], **options: Any) -> Any:
+    options["no_cpython_wrapper"] = issubclass(dispatcher, _InnerDispatcher)
+    made: Any = numba.njit(**_OPTIONS, **options)(function)
+    if isinstance(made, CPUDispatcher):  # not where compilation is turned off
+        made.__class__ = dispatcher
+        if CACHE_DIR is not None:
+            made.enable_caching()
+    return made
