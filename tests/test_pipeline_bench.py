@@ -1,5 +1,6 @@
 """The speed study: every section runs, whatever the times are."""
 
+import importlib
 import json
 import math
 import os
@@ -91,3 +92,14 @@ def test_files_are_written(out):
     for picture in ("kernels.png", "solver.png", "memory.png"):
         assert picture in text
         assert 5_000 < (out / picture).stat().st_size < 150_000
+
+
+@pytest.mark.slow
+def test_python_s_share_is_a_part_of_the_whole(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    child = importlib.import_module("child")
+    found = child.call("python_share", "measure", num_threads=2, num_frames=3)
+    assert 0.0 < found["imports_s"] < found["python_s"]
+    assert 0.0 < found["kernels_s"] < found["cpu_s"] - found["python_s"]
+    # SIFT and its matches, which pycolmap finds in threads of ours and its own.
+    assert found["python_s"] < 0.5 * found["cpu_s"]

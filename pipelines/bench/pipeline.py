@@ -113,7 +113,10 @@ def all_sections(options: argparse.Namespace) -> Sections:
                 binary=options.refractive_colmap,
             )
     sections["demo"] = partial(demo.measure, small=small)
-    if not small:
+    if not small:  # both may have to compile everything
+        sections["python-share"] = partial(
+            call, "python_share", "measure", num_threads=2, num_frames=14
+        )
         sections["first-run"] = demo.first_run
     return sections
 

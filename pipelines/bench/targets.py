@@ -47,7 +47,7 @@ class Outcome:
 
 def outcomes(results: Results) -> list[Outcome]:
     found = [*_kernels(results), *_solver(results), *_growth(results)]
-    return found + [*_peers(results), *_demo(results)]
+    return found + [*_peers(results), *_demo(results), *_python(results)]
 
 
 def kernel_times(results: Results, kind: str, port: str, lens: str) -> dict[str, float]:
@@ -216,3 +216,17 @@ def _demo(results: Results) -> Iterator[Outcome]:
                 measured=found[key],
                 note=disturbed(found),
             )
+
+
+def _python(results: Results) -> Iterator[Outcome]:
+    found = results.get("python-share")
+    if found is None:
+        return
+    yield Outcome(
+        what="`uwsfm reconstruct`: CPU outside pycolmap and the kernels",
+        target=10.0,
+        unit="%",
+        measured=100.0 * found["python_s"] / found["cpu_s"],
+        note=f"{found['python_s']:.1f} of {found['cpu_s']:.1f} s, of which "
+        f"{found['imports_s']:.1f} s import; {found['frames']} frames",
+    )
