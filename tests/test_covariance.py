@@ -14,6 +14,7 @@ from uwsfm.residuals.border import BORDER_SIZE, WATER_INDEX
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import lawn_mower
+from uwsfm.solver.assembly import expand_cells
 from uwsfm.solver.covariance import point_covariances, reduced_covariance
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.state import State
@@ -128,7 +129,9 @@ def sparse_normal_matrix(layout, eqs):
         for cell in range(layout.point_start[point], layout.point_start[point + 1]):
             col = layout.frame_col[layout.cell_frame[cell]]
             if col != HELD:
-                add_both(col, at, eqs.cells[cell])
+                coupled = np.empty((1, 6, 3))
+                expand_cells(eqs.cells, cell, cell + 1, coupled)
+                add_both(col, at, coupled[0])
     shape = (first + 3 * len(eqs.points),) * 2
     triplets = (np.concatenate(rows), np.concatenate(cols))
     return sp.coo_array((np.concatenate(values), triplets), shape=shape).tocsc()

@@ -22,6 +22,7 @@ from uwsfm.simulate import (
 from uwsfm.simulate.rigs import stereo_rig
 from uwsfm.simulate.trajectories import rich_motion
 from uwsfm.solver import levenberg_marquardt as lm
+from uwsfm.solver.assembly import expand_cells
 from uwsfm.solver.error_models import ERROR_CODES, error_model
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.state import State
@@ -104,6 +105,7 @@ def dense_of(layout, eqs):
     size = offset + layout.num_border_cols
     total = size + 3 * len(eqs.points)
     matrix, gradient = np.zeros((total, total)), np.zeros(total)
+    coupled = np.empty((1, 6, 3))
     rim = slice(offset, size)
     matrix[rim, rim], gradient[rim] = eqs.border, eqs.border_grad
     for f, col in enumerate(layout.frame_col):
@@ -118,7 +120,8 @@ def dense_of(layout, eqs):
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             col = layout.frame_col[layout.cell_frame[c]]
             if col != HELD:
-                matrix[col : col + 6, rows] = eqs.cells[c]
+                expand_cells(eqs.cells, c, c + 1, coupled)
+                matrix[col : col + 6, rows] = coupled[0]
     return np.triu(matrix) + np.triu(matrix, 1).T, gradient
 
 

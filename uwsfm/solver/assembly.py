@@ -96,9 +96,8 @@ def rotation(frames, f):
 
 
 @inner_fused
-def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
-    """Row a of M^T H: times M it belongs to the frame, times R to the coupling."""
-    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+def _add_pose_row(a, x, y, z, m0, m1, m2, f, frames):
+    """Row a of M^T H, times M."""
     q0, q1, q2 = _torque(x, y, z, m0, m1, m2)
     frames[f, a, 0] += q0
     frames[f, a, 1] += q1
@@ -106,18 +105,38 @@ def _add_pose_row(a, x, y, z, m0, m1, m2, frame, f, c, frames, cells):
     frames[f, a, 3] += m0
     frames[f, a, 4] += m1
     frames[f, a, 5] += m2
-    w0 = m0 * r11 + m1 * r21 + m2 * r31
-    w1 = m0 * r12 + m1 * r22 + m2 * r32
-    w2 = m0 * r13 + m1 * r23 + m2 * r33
-    cells[c, a, 0], cells[c, a, 1], cells[c, a, 2] = w0, w1, w2
-    return w0, w1, w2
+
+
+@lane
+def _times_rotation(m0, m1, m2, frame):
+    """Row of H R."""
+    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+    return (
+        m0 * r11 + m1 * r21 + m2 * r31,
+        m0 * r12 + m1 * r22 + m2 * r32,
+        m0 * r13 + m1 * r23 + m2 * r33,
+    )
+
+
+@inner_fused
+def expand_cells(cells, first, last, w):
+    """W = M^T H R (6, 3) of some cells, from H R and q, into the first of ``w``."""
+    for c in range(first, last):
+        at = c - first
+        x, y, z = cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2]
+        for b in range(3):
+            n0, n1, n2 = cells[c, 0, b], cells[c, 1, b], cells[c, 2, b]
+            w[at, 0, b] = y * n2 - z * n1
+            w[at, 1, b] = z * n0 - x * n2
+            w[at, 2, b] = x * n1 - y * n0
+            w[at, 3, b], w[at, 4, b], w[at, 5, b] = n0, n1, n2
 
 
 @inner_fused
 def add_cell(
     x, y, z, frame, p, c, f, sums_of_cell, frames, frames_grad, cells, grad, v
 ):
-    """Expand a cell's sums to its frame, its point and their coupling W = M^T H R.
+    """Expand a cell's sums to its frame, its point and their coupling (H R, and q).
 
     Args:
         x, y, z: the point in the rig.
@@ -125,7 +144,7 @@ def add_cell(
         p, c, f: point, cell, and row of the frame in the sums.
         sums_of_cell: H (lower triangle) and g by the point in the rig, 9 scalars.
         frames, frames_grad: of `Sums`, added to.
-        cells, grad, v: of `NormalEquations`; the cell's W is written.
+        cells, grad, v: of `NormalEquations`; the cell is written.
     """
     h00, h10, h11, h20, h21, h22, g0, g1, g2 = sums_of_cell
     t00, t10, t20 = _torque(x, y, z, h00, h10, h20)
@@ -134,12 +153,16 @@ def add_cell(
     # Literals would compile the function once for each of them.
     row0, row1, row2 = np.int64(0), np.int64(1), np.int64(2)
     row3, row4, row5 = np.int64(3), np.int64(4), np.int64(5)
-    _add_pose_row(row0, x, y, z, t00, t01, t02, frame, f, c, frames, cells)
-    _add_pose_row(row1, x, y, z, t10, t11, t12, frame, f, c, frames, cells)
-    _add_pose_row(row2, x, y, z, t20, t21, t22, frame, f, c, frames, cells)
-    a = _add_pose_row(row3, x, y, z, h00, h10, h20, frame, f, c, frames, cells)
-    b = _add_pose_row(row4, x, y, z, h10, h11, h21, frame, f, c, frames, cells)
-    d = _add_pose_row(row5, x, y, z, h20, h21, h22, frame, f, c, frames, cells)
+    _add_pose_row(row0, x, y, z, t00, t01, t02, f, frames)
+    _add_pose_row(row1, x, y, z, t10, t11, t12, f, frames)
+    _add_pose_row(row2, x, y, z, t20, t21, t22, f, frames)
+    _add_pose_row(row3, x, y, z, h00, h10, h20, f, frames)
+    _add_pose_row(row4, x, y, z, h10, h11, h21, f, frames)
+    _add_pose_row(row5, x, y, z, h20, h21, h22, f, frames)
+    a = _times_rotation(h00, h10, h20, frame)
+    b = _times_rotation(h10, h11, h21, frame)
+    d = _times_rotation(h20, h21, h22, frame)
+    cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2] = x, y, z
     q0, q1, q2 = _torque(x, y, z, g0, g1, g2)
     frames_grad[f, 0] += q0
     frames_grad[f, 1] += q1
@@ -151,7 +174,8 @@ def add_cell(
     grad[p, 0] += r11 * g0 + r21 * g1 + r31 * g2
     grad[p, 1] += r12 * g0 + r22 * g1 + r32 * g2
     grad[p, 2] += r13 * g0 + r23 * g1 + r33 * g2
-    for k in range(3):  # R^T H R: the lower half of M^T H R, rows a, b, d, is H R
+    for k in range(3):
+        cells[c, 0, k], cells[c, 1, k], cells[c, 2, k] = a[k], b[k], d[k]
         v[p, 0, k] += r11 * a[k] + r21 * b[k] + r31 * d[k]
         v[p, 1, k] += r12 * a[k] + r22 * b[k] + r32 * d[k]
         v[p, 2, k] += r13 * a[k] + r23 * b[k] + r33 * d[k]

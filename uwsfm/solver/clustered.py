@@ -36,9 +36,14 @@ def _reach_of_point(layout, eqs, p, rows, out):
             col = layout.frame_col[layout.cell_frame[c]]
             if col == HELD:
                 continue
-            for a in range(6):
-                for i in range(3):
-                    out[b, i] += rows[b, col + a] * eqs.cells[c, a, i]
+            x, y, z = eqs.cells[c, 3]
+            r0, r1, r2 = rows[b, col], rows[b, col + 1], rows[b, col + 2]
+            m0 = rows[b, col + 3] + r1 * z - r2 * y
+            m1 = rows[b, col + 4] + r2 * x - r0 * z
+            m2 = rows[b, col + 5] + r0 * y - r1 * x
+            for i in range(3):
+                out[b, i] += m0 * eqs.cells[c, 0, i]
+                out[b, i] += m1 * eqs.cells[c, 1, i] + m2 * eqs.cells[c, 2, i]
         for k in range(len(eqs.border_grad)):
             for i in range(3):
                 out[b, i] += rows[b, offset + k] * eqs.points_border[p, i, k]

@@ -8,6 +8,7 @@ import numpy as np
 from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver import schur
+from uwsfm.solver.assembly import expand_cells
 from uwsfm.solver.block_graph import find_block
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.normal_equations import NormalEquations
@@ -160,7 +161,7 @@ def _point_covariances(point_start, graph, eqs, known, first, last, out):
     largest = 0
     for p in range(first, last):
         largest = max(largest, point_start[p + 1] - point_start[p])
-    reach = np.empty((largest, 6, 3))
+    reach, coupled = np.empty((largest, 6, 3)), np.empty((1, 6, 3))
     inverse_block, sideways = np.empty((3, 3)), np.empty((len(border), 3))
     part = np.empty((3, 3))
     for p in range(first, last):
@@ -178,7 +179,8 @@ def _point_covariances(point_start, graph, eqs, known, first, last, out):
             i = cell_row[c]
             if i == HELD:
                 continue
-            _multiply(cells[c], inverse_block, reach[c - start])
+            expand_cells(cells, c, c + 1, coupled)
+            _multiply(coupled[0], inverse_block, reach[c - start])
             _product(reach[c - start], coupling[i], sideways, part)
             _add_both_ways(part, out[p])
             s = row_start[i]

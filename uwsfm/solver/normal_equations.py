@@ -55,7 +55,8 @@ class NormalEquations(NamedTuple):
     points_border: Array
     """E (P, 3, B)"""
     cells: Array
-    """W (K, 6, 3): frame against point."""
+    """(K, 4, 3): H R, and q, of which frame against point is made: W (6, 3) = M^T H R.
+    Two thirds of its memory, and of what has to be read."""
     frames: Array
     """U (F, 6, 6)"""
     frames_grad: Array
@@ -76,7 +77,7 @@ def empty_normal_equations(layout: Layout) -> NormalEquations:
         points=np.zeros((num_points, 3, 3)),
         points_grad=np.zeros((num_points, 3)),
         points_border=np.zeros((num_points, 3, num_border)),
-        cells=np.zeros((len(layout.cell_frame), 6, 3)),
+        cells=np.zeros((len(layout.cell_frame), 4, 3)),
         frames=np.zeros((num_frames, 6, 6)),
         frames_grad=np.zeros((num_frames, 6)),
         frames_border=np.zeros((num_frames, 6, num_border)),

@@ -96,14 +96,32 @@ def invert_points(eqs, damping, first, last, inverses, border, right):
                 border[k, m] -= s0 * e[p, 0, m] + s1 * e[p, 1, m] + s2 * e[p, 2, m]
 
 
+@lane
+def _rows(cells, c):
+    """W (6, 3) of a cell by rows, see `NormalEquations.cells`."""
+    x, y, z = cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2]
+    a0, a1, a2 = cells[c, 0, 0], cells[c, 0, 1], cells[c, 0, 2]
+    b0, b1, b2 = cells[c, 1, 0], cells[c, 1, 1], cells[c, 1, 2]
+    d0, d1, d2 = cells[c, 2, 0], cells[c, 2, 1], cells[c, 2, 2]
+    return (
+        (y * d0 - z * b0, y * d1 - z * b1, y * d2 - z * b2),
+        (z * a0 - x * d0, z * a1 - x * d1, z * a2 - x * d2),
+        (x * b0 - y * a0, x * b1 - y * a1, x * b2 - y * a2),
+        (a0, a1, a2),
+        (b0, b1, b2),
+        (d0, d1, d2),
+    )
+
+
 @inner_fused
 def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
     """W V^-1 (6, 3) of one cell, and its part of the right side of row i."""
     v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
     v11, v12, v22 = inverses[p, 1, 1], inverses[p, 1, 2], inverses[p, 2, 2]
     g0, g1, g2 = grads[p, 0], grads[p, 1], grads[p, 2]
+    rows = _rows(cells, c)
     for a in range(6):
-        w0, w1, w2 = cells[c, a, 0], cells[c, a, 1], cells[c, a, 2]
+        w0, w1, w2 = rows[a]
         f0 = w0 * v00 + w1 * v01 + w2 * v02
         f1 = w0 * v01 + w1 * v11 + w2 * v12
         f2 = w0 * v02 + w1 * v12 + w2 * v22
@@ -125,17 +143,40 @@ def _columns(folded):
 
 
 @lane
-def _subtract_line(values, i, k, columns, w0, w1, w2):
-    """values[i, k] (6) -= W V^-1 (w0, w1, w2): all is loaded before it is stored."""
+def _line(columns, w0, w1, w2):
+    """W V^-1 (w0, w1, w2), six numbers."""
     (f00, f10, f20), (f30, f40, f50) = columns[0], columns[1]
     (f01, f11, f21), (f31, f41, f51) = columns[2], columns[3]
     (f02, f12, f22), (f32, f42, f52) = columns[4], columns[5]
-    b0 = values[i, k, 0] - (f00 * w0 + f01 * w1 + f02 * w2)
-    b1 = values[i, k, 1] - (f10 * w0 + f11 * w1 + f12 * w2)
-    b2 = values[i, k, 2] - (f20 * w0 + f21 * w1 + f22 * w2)
-    b3 = values[i, k, 3] - (f30 * w0 + f31 * w1 + f32 * w2)
-    b4 = values[i, k, 4] - (f40 * w0 + f41 * w1 + f42 * w2)
-    b5 = values[i, k, 5] - (f50 * w0 + f51 * w1 + f52 * w2)
+    return (
+        f00 * w0 + f01 * w1 + f02 * w2,
+        f10 * w0 + f11 * w1 + f12 * w2,
+        f20 * w0 + f21 * w1 + f22 * w2,
+        f30 * w0 + f31 * w1 + f32 * w2,
+        f40 * w0 + f41 * w1 + f42 * w2,
+        f50 * w0 + f51 * w1 + f52 * w2,
+    )
+
+
+@lane
+def _subtract(values, i, k, line):
+    """values[i, k] (6) -= a line: all is loaded before it is stored."""
+    b0, b1 = values[i, k, 0] - line[0], values[i, k, 1] - line[1]
+    b2, b3 = values[i, k, 2] - line[2], values[i, k, 3] - line[3]
+    b4, b5 = values[i, k, 4] - line[4], values[i, k, 5] - line[5]
+    values[i, k, 0], values[i, k, 1], values[i, k, 2] = b0, b1, b2
+    values[i, k, 3], values[i, k, 4], values[i, k, 5] = b3, b4, b5
+
+
+@lane
+def _subtract_cross(values, i, k, y, c, z, b):
+    """values[i, k] (6) -= y c - z b of two lines, one row of q x M."""
+    b0 = values[i, k, 0] - y * c[0] + z * b[0]
+    b1 = values[i, k, 1] - y * c[1] + z * b[1]
+    b2 = values[i, k, 2] - y * c[2] + z * b[2]
+    b3 = values[i, k, 3] - y * c[3] + z * b[3]
+    b4 = values[i, k, 4] - y * c[4] + z * b[4]
+    b5 = values[i, k, 5] - y * c[5] + z * b[5]
     values[i, k, 0], values[i, k, 1], values[i, k, 2] = b0, b1, b2
     values[i, k, 3], values[i, k, 4], values[i, k, 5] = b3, b4, b5
 
@@ -146,7 +187,7 @@ def _subtract_border(borders, p, i, folded, coupling):
     columns = _columns(folded)
     for k in range(coupling.shape[1]):
         w0, w1, w2 = borders[p, 0, k], borders[p, 1, k], borders[p, 2, k]
-        _subtract_line(coupling, i, k, columns, w0, w1, w2)
+        _subtract(coupling, i, k, _line(columns, w0, w1, w2))
 
 
 @inner_fused
@@ -155,15 +196,26 @@ def _subtract_products(
 ):
     """Blocks of row i -= W' (W V^-1)^T for the cells W' of a point up to its own."""
     columns = _columns(folded)
+    # Literals would compile the functions once for each of them.
+    row0, row1, row2 = np.int64(0), np.int64(1), np.int64(2)
+    row3, row4, row5 = np.int64(3), np.int64(4), np.int64(5)
     s = row_start[i]
     for c in range(first, last):
         j = cell_row[c]
         if j == HELD:
             continue
         s = find_block(row_start, row_other, i, j, s)
-        for b in range(6):
-            w0, w1, w2 = cells[c, b, 0], cells[c, b, 1], cells[c, b, 2]
-            _subtract_line(blocks, s, b, columns, w0, w1, w2)
+        x, y, z = cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2]
+        # The lower rows, of H R; the upper ones are q x these.
+        l0 = _line(columns, cells[c, 0, 0], cells[c, 0, 1], cells[c, 0, 2])
+        l1 = _line(columns, cells[c, 1, 0], cells[c, 1, 1], cells[c, 1, 2])
+        l2 = _line(columns, cells[c, 2, 0], cells[c, 2, 1], cells[c, 2, 2])
+        _subtract_cross(blocks, s, row0, y, l2, z, l1)
+        _subtract_cross(blocks, s, row1, z, l0, x, l2)
+        _subtract_cross(blocks, s, row2, x, l1, y, l0)
+        _subtract(blocks, s, row3, l0)
+        _subtract(blocks, s, row4, l1)
+        _subtract(blocks, s, row5, l2)
 
 
 @inner_fused
@@ -223,27 +275,32 @@ def substitute_points(
     point_start, graph, eqs, inverses, frames_step, border_step, first, last, out
 ):
     """Steps (P, 3) of some points from those of the frames (F, 6) and border (B,)."""
+    grads, borders, cells = eqs.points_grad, eqs.points_border, eqs.cells
+    cell_row = graph.cell_row
     for p in range(first, last):
-        g, e = eqs.points_grad[p], eqs.points_border[p]
-        b0, b1, b2 = -g[0], -g[1], -g[2]
+        b0, b1, b2 = -grads[p, 0], -grads[p, 1], -grads[p, 2]
         for k in range(len(border_step)):
             s = border_step[k]
-            b0 -= e[0, k] * s
-            b1 -= e[1, k] * s
-            b2 -= e[2, k] * s
+            b0 -= borders[p, 0, k] * s
+            b1 -= borders[p, 1, k] * s
+            b2 -= borders[p, 2, k] * s
         for c in range(point_start[p], point_start[p + 1]):
-            i = graph.cell_row[c]
+            i = cell_row[c]
             if i == HELD:
                 continue
-            for a in range(6):
-                s = frames_step[i, a]
-                b0 -= eqs.cells[c, a, 0] * s
-                b1 -= eqs.cells[c, a, 1] * s
-                b2 -= eqs.cells[c, a, 2] * s
-        v = inverses[p]
-        out[p, 0] = v[0, 0] * b0 + v[0, 1] * b1 + v[0, 2] * b2
-        out[p, 1] = v[1, 0] * b0 + v[1, 1] * b1 + v[1, 2] * b2
-        out[p, 2] = v[2, 0] * b0 + v[2, 1] * b1 + v[2, 2] * b2
+            # W^T s = (H R)^T (s1 + s0 x q)
+            x, y, z = cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2]
+            t0, t1, t2 = frames_step[i, 0], frames_step[i, 1], frames_step[i, 2]
+            m0 = frames_step[i, 3] + t1 * z - t2 * y
+            m1 = frames_step[i, 4] + t2 * x - t0 * z
+            m2 = frames_step[i, 5] + t0 * y - t1 * x
+            b0 -= cells[c, 0, 0] * m0 + cells[c, 1, 0] * m1 + cells[c, 2, 0] * m2
+            b1 -= cells[c, 0, 1] * m0 + cells[c, 1, 1] * m1 + cells[c, 2, 1] * m2
+            b2 -= cells[c, 0, 2] * m0 + cells[c, 1, 2] * m1 + cells[c, 2, 2] * m2
+        for a in range(3):
+            out[p, a] = (
+                inverses[p, a, 0] * b0 + inverses[p, a, 1] * b1 + inverses[p, a, 2] * b2
+            )
 
 
 def damped_border(layout: Layout, eqs: NormalEquations, damping: float) -> Array:
