@@ -74,3 +74,18 @@ def test_the_sample_rig_has_no_camera_without_observations():
     only_left, _ = scene.select(scene.camera_idx == 0)
     found = camera_residuals(only_left, [c.name for c in sample_rig().cameras])
     assert [camera.name for camera in found] == ["left"]
+
+
+def test_a_wrong_lens_is_told_from_a_wrong_port():
+    scene = simulated_dive(num_frames=6, num_points=2000).truth
+    (right, _) = camera_residuals(scene, ["left", "right"])
+    assert right.freed is None and right.refractive.systematic_px < 1e-6
+    lens = scene.cameras[0].lens.copy()
+    lens[0] *= 1.003
+    wrong = replace(scene, cameras=(scene.cameras[0].with_lens(lens), scene.cameras[1]))
+    (found, _) = camera_residuals(wrong, ["left", "right"])
+    # 0.3 % of an image whose corners are half its focal length away from its centre.
+    assert 0.3 < found.refractive.systematic_px < 1.5
+    assert found.refractive.systematic_px > found.pinhole.systematic_px
+    # Exact but for the tolerance of the fit, as above.
+    assert found.freed.rms_px < 1e-4

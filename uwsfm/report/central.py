@@ -1,4 +1,4 @@
-"""What the best pinhole leaves of the same observations, poses and points."""
+"""Cameras with a free lens, fitted to the same observations, frames and points held."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import pycolmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.port import FlatPort, NoPort
+from uwsfm.models.port import FlatPort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 
 _LEAST_MODEL = "OPENCV"
@@ -19,22 +19,22 @@ _MAX_FITTED = 8_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CentralFit:
-    """A camera without a port, fitted to what one behind its port has observed."""
+class FittedCamera:
+    """A camera fitted to the observations of another, points and frames held."""
 
     camera: RefractiveCamera
-    pinhole_from_cam: Array
-    """Pose (7,): where the one centre of all rays came to lie."""
+    fitted_from_cam: Array
+    """Pose (7,) of the fitted camera in the frame of the other."""
 
     def residuals(self, points_in_cam: Array, xy: Array) -> Array:
         """Projection minus observation (N, 2) px; NaN where there is none."""
-        in_pinhole = rigid3.transform(self.pinhole_from_cam, points_in_cam)
-        return self.camera.img_from_point(in_pinhole)[0] - xy
+        in_fitted = rigid3.transform(self.fitted_from_cam, points_in_cam)
+        return self.camera.img_from_point(in_fitted)[0] - xy
 
 
 def fit_central(
     camera: RefractiveCamera, points_in_cam: Array, xy: Array
-) -> CentralFit | None:
+) -> FittedCamera | None:
     """The pinhole with distortion that fits best, in least squares.
 
     Free are its position and rotation, both focal lengths, the principal point and the
@@ -49,24 +49,43 @@ def fit_central(
     Returns:
         None: there is no port, or not enough to fit to.
     """
+    if isinstance(camera.port, NoPort):
+        return None
+    lens = camera.lens.copy()
+    if isinstance(camera.port, FlatPort):
+        lens[:2] *= camera.port.n_water
+        lens[4:NUM_PARAMS] = 0.0  # of other angles: what it is in water is fitted
+    return _fitted(_with_distortion(camera, lens, NoPort()), points_in_cam, xy)
+
+
+def fit_lens(
+    camera: RefractiveCamera, points_in_cam: Array, xy: Array
+) -> FittedCamera | None:
+    """The same with the port as it is: as free as `fit_central`, rays that bend."""
+    base = _with_distortion(camera, camera.lens, camera.port)
+    return _fitted(base, points_in_cam, xy)
+
+
+def _fitted(
+    base: RefractiveCamera, points_in_cam: Array, xy: Array
+) -> FittedCamera | None:
     from scipy.optimize import least_squares  # heavy
 
-    base = _start(camera)
     slots = list(param_slots(base.camera.model_name))
     rows = np.linspace(0, len(xy) - 1, min(len(xy), _MAX_FITTED)).astype(np.int64)
-    if isinstance(camera.port, NoPort) or 2 * len(rows) <= len(slots) + 6:
+    if 2 * len(rows) <= len(slots) + 6:
         return None
     points, pixels = points_in_cam[rows], xy[rows]
     depth = float(np.median(points[:, 2]))
     scale = np.array([1.0, 1.0, 1.0, depth, depth, depth])
 
-    def fit_at(unknowns: Array) -> CentralFit:
+    def fit_at(unknowns: Array) -> FittedCamera:
         row, lens = base.lens.copy(), unknowns[6:]
         row[:2] *= np.exp(lens[:2])
         row[2:4] += row[:2] * lens[2:4]
         row[slots[4:]] += lens[4:]
         pose = rigid3.perturb(rigid3.IDENTITY, scale * unknowns[:6])
-        return CentralFit(camera=base.with_lens(row), pinhole_from_cam=pose)
+        return FittedCamera(camera=base.with_lens(row), fitted_from_cam=pose)
 
     def residuals(unknowns: Array) -> Array:
         found = fit_at(unknowns).residuals(points, pixels)
@@ -78,19 +97,17 @@ def fit_central(
     return fit_at(found.x)
 
 
-def _start(camera: RefractiveCamera) -> RefractiveCamera:
-    """The lens without its port, magnified as the water does, with all distortion."""
+def _with_distortion(
+    camera: RefractiveCamera, lens: Array, port: Port
+) -> RefractiveCamera:
+    """A lens row behind a port, as a model that has all usual distortion."""
     model = camera.camera.model_name
     if model not in _LARGER_MODELS:
         model = _LEAST_MODEL
-    row = camera.lens.copy()
-    if isinstance(camera.port, FlatPort):
-        row[:2] *= camera.port.n_water
-        row[4:NUM_PARAMS] = 0.0  # of other angles: what it is in water is fitted
-    lens = pycolmap.Camera(
+    larger = pycolmap.Camera(
         model=model,
         width=camera.width,
         height=camera.height,
-        params=row[list(param_slots(model))],
+        params=lens[list(param_slots(model))],
     )
-    return RefractiveCamera(lens, NoPort())
+    return RefractiveCamera(larger, port)

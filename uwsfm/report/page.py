@@ -23,8 +23,8 @@ _BADGES = {
     "arbitrary": "bad",
     "ran into zero": "bad",
 }
-NOTICEABLE_PX = 0.03
-"""Of systematic residuals: what feature detectors may do by themselves."""
+LENS_SHARE = 0.7
+"""Of systematic residuals: if less is left with a free lens, it was the lens."""
 _SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
 """A shape beside the word: colour alone tells nothing to many."""
 
@@ -63,7 +63,7 @@ def page_of(report: Report) -> str:
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
         systematic=_systematic_words(report),
         view_caption=_view_caption(report),
-        residual_words=[_residual_words(camera, report) for camera in report.residuals],
+        residual_words=[_residual_words(camera) for camera in report.residuals],
         pinhole_models=_pinhole_models(report),
         scales=scales,
         fewest=FEWEST,
@@ -143,14 +143,15 @@ def _pinhole_models(report: Report) -> str:
     return "COLMAP's OPENCV" + "".join(f" or {model}" for model in sorted(models))
 
 
-def _residual_words(camera: CameraResiduals, report: Report) -> str:
+def _residual_words(camera: CameraResiduals) -> str:
     ours = camera.refractive
     noise = f"{ours.rms_px:.3g} px RMS"
     if camera.pinhole is None:
         return (
-            "There is no pinhole to compare with: this camera has no port, or too few "
-            f"observations. uwsfm leaves {noise}, of which "
-            f"{_systematic(ours.systematic_px)} is systematic."
+            "There is no pinhole to compare with: this camera has no port, too few "
+            "observations, or some that no fitted pinhole projects. "
+            f"uwsfm leaves {noise}, of which "
+            f"{_systematic(ours.systematic_px)} is systematic.{_freed_words(camera)}"
         )
     theirs = camera.pinhole
     text = (
@@ -165,22 +166,22 @@ def _residual_words(camera: CameraResiduals, report: Report) -> str:
             f"depth, is off by {rms:.2g} px RMS and up to {most:.2g} px at the 10th "
             "and 90th percentile of depth."
         )
-    if ours.systematic_px > max(theirs.systematic_px, NOTICEABLE_PX):
-        text += (
-            " That the pinhole leaves less of it here is no merit of a single centre: "
-            f"its lens was fitted to these very observations, and {_our_lens(report)}"
-        )
-    return text
+    return f"{text}{_freed_words(camera)}"
 
 
-def _our_lens(report: Report) -> str:
-    refined = " ".join(row["name"] for row in report.summary["refined"])
-    if "fx of" in refined or "f of" in refined:
-        return "uwsfm refined its own with everything else."
-    return (
-        "uwsfm holds that of the calibration in air. Most likely that calibration is a "
-        "little wrong: --refine focal, principal-point and distortion tell."
+def _freed_words(camera: CameraResiduals) -> str:
+    """What becomes of systematic residuals if the lens may change."""
+    freed, ours = camera.freed, camera.refractive
+    if freed is None:
+        return ""
+    text = (
+        " Fitted in the same way, lens and placement free behind the port as it is, "
+        f"uwsfm's model leaves {freed.rms_px:.3g} px RMS, of which "
+        f"{_systematic(freed.systematic_px)}"
     )
+    if freed.systematic_px < LENS_SHARE * ours.systematic_px:
+        return f"{text}: it is the lens, as given, that does not fit."
+    return f"{text}: it is not the lens alone that does not fit."
 
 
 def _systematic_words(report: Report) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.report.central import fit_central
+from uwsfm.report.central import FittedCamera, fit_central, fit_lens
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
 
@@ -22,6 +22,8 @@ PER_CELL = 25
 """Observations that a cell has on average, if so many cells have them."""
 RADII, DEPTHS = 10, 8
 """Bins of the two profiles."""
+NOTICEABLE_PX = 0.03
+"""Of systematic residuals: more than feature detectors do by themselves."""
 FEWEST = 8
 """Observations in a bin whose mean is worth showing."""
 NEARNESS = ("near", "middle", "far")
@@ -74,6 +76,9 @@ class CameraResiduals:
     """Camera model of the pinhole."""
     pinhole: Residuals | None
     """None: there is no port, or too little to fit a pinhole to."""
+    freed: Residuals | None
+    """Of the refractive model with its lens as free as the pinhole's; None: it leaves
+    little, or less than the pinhole, as it is."""
     least_central_px: tuple[float, float] | None
     """RMS and maximum of what any single centre leaves at the 10th and 90th percentile
     of depth, even of a lens that is exact at the median; None as above."""
@@ -114,24 +119,38 @@ def camera_residuals(scene: Scene, names: list[str]) -> list[CameraResiduals]:
         if not len(rows):
             continue
         xy, points = scene.xy[rows], in_cam[rows]
-        places = _places(camera, xy, points)
-        pinhole, fit = None, fit_central(camera, points, xy)
-        if fit is not None:
-            left = fit.residuals(points, xy)
-            pinhole = _residuals(places, left) if np.all(np.isfinite(left)) else None
-        counts = np.bincount(places.cell, minlength=np.prod(places.shape))
-        found.append(
-            CameraResiduals(
-                name=names[index],
-                size=(camera.width, camera.height),
-                counts=counts.reshape(places.shape),
-                refractive=_residuals(places, residuals[rows]),
-                model="" if fit is None else fit.camera.camera.model_name,
-                pinhole=pinhole,
-                least_central_px=_least_central(camera, places.depth),
-            )
-        )
+        found.append(_camera(names[index], camera, points, xy, residuals[rows]))
     return found
+
+
+def _camera(
+    name: str, camera: RefractiveCamera, points: Array, xy: Array, ours: Array
+) -> CameraResiduals:
+    places = _places(camera, xy, points)
+
+    def left_by(fit: FittedCamera | None) -> Residuals | None:
+        left = None if fit is None else fit.residuals(points, xy)
+        if left is None or not np.all(np.isfinite(left)):
+            return None
+        return _residuals(places, left)
+
+    central = fit_central(camera, points, xy)
+    pinhole, refractive = left_by(central), _residuals(places, ours)
+    allowed = 0.0 if pinhole is None else pinhole.systematic_px
+    freed = None
+    if refractive.systematic_px > max(NOTICEABLE_PX, allowed):
+        freed = left_by(fit_lens(camera, points, xy))
+    counts = np.bincount(places.cell, minlength=int(np.prod(places.shape)))
+    return CameraResiduals(
+        name=name,
+        size=(camera.width, camera.height),
+        counts=counts.reshape(places.shape),
+        refractive=refractive,
+        model="" if central is None else central.camera.camera.model_name,
+        pinhole=pinhole,
+        freed=freed,
+        least_central_px=_least_central(camera, places.depth),
+    )
 
 
 def _least_central(
