@@ -29,6 +29,7 @@ COMMANDS = [
     ["color"],
     ["export"],
     ["map"],
+    ["mesh"],
     ["report"],
     ["view"],
     ["simulate"],

@@ -40,19 +40,32 @@ def write_ply(
 
     Args:
         path: the file; replaced when all of it is there.
-        tables: name and structured array of each element.
+        tables: name and structured array of each element; a column of rows, such as
+            a triangle's three vertices, is a list, and the column before it its length.
         comment: one line.
     """
     header = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
     for element, table in tables:
         header.append(f"element {element} {len(table)}")
-        for name in table.dtype.names or ():
-            kind = table.dtype[name].str.lstrip("|")
-            header.append(f"property {_NAMES[kind]} {name}")
+        header += _properties(table.dtype)
     with replaced_file(path) as partial, partial.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
         for _, table in tables:
             table.tofile(file)
+
+
+def _properties(kinds: np.dtype) -> list[str]:
+    """Lines of a header."""
+    lines: list[str] = []
+    for name in kinds.names or ():
+        base, shape = kinds[name].base, kinds[name].shape
+        kind = _NAMES[base.str.lstrip("|")]
+        if shape:
+            _, length, _ = lines.pop().split()
+            lines.append(f"property list {length} {kind} {name}")
+        else:
+            lines.append(f"property {kind} {name}")
+    return lines
 
 
 def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:

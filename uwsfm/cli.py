@@ -29,7 +29,7 @@ from uwsfm.cli_options import (
     wanted_of,
 )
 from uwsfm.cli_simulate import simulate_app
-from uwsfm.cli_surface import clean, color, map_
+from uwsfm.cli_surface import clean, color, map_, mesh
 from uwsfm.cli_view import report, view
 from uwsfm.errors import InputError, UwsfmError
 
@@ -50,6 +50,7 @@ app.command()(dense)
 app.command()(measure)
 app.command()(clean)
 app.command()(color)
+app.command()(mesh)
 app.command("map")(map_)
 app.command()(report)
 app.command()(view)

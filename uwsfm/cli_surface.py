@@ -13,6 +13,14 @@ SourceArgument = Annotated[
         "PLY file.",
     ),
 ]
+UpOption = Annotated[
+    Literal["plane", "x", "y", "z", "-x", "-y", "-z"] | None,
+    typer.Option(
+        help="The world's axis that points up, --up=z or --up=-z; plane: the plane "
+        "through the points is level (the default without positions).",
+        show_default=False,
+    ),
+]
 
 
 def clean(
@@ -70,17 +78,59 @@ def clean(
     typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
 
 
-def map_(
+def mesh(
     source: SourceArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
-    up: Annotated[
-        Literal["plane", "x", "y", "z", "-x", "-y", "-z"] | None,
+    method: Annotated[
+        Literal["poisson", "ball-pivoting"],
         typer.Option(
-            help="The world's axis that points up, --up=z or --up=-z; plane: the plane "
-            "through the points is level (the default without positions).",
+            help="Poisson smooths over noise, ball pivoting keeps the points."
+        ),
+    ] = "poisson",
+    max_distance: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Of the surface from the points (default: four of their spacings); "
+            "what is further is a hole.",
             show_default=False,
         ),
     ] = None,
+    up: UpOption = None,
+    web_triangles: Annotated[
+        int, typer.Option(help="Of the decimated copy, at most.")
+    ] = 100_000,
+) -> None:
+    """Write a surface through the points: PLY, OBJ, GLB and a small GLB for the web."""
+    from rich.markup import escape
+
+    from uwsfm.console import console
+    from uwsfm.surface.commands import mesh_cloud
+
+    report = mesh_cloud(
+        source,
+        out,
+        method=method,
+        max_distance=max_distance,
+        up=up,
+        web_triangles=web_triangles,
+    )
+    short = "m" if report["unit"] == "metre" else "of an arbitrary unit"
+    typer.echo(
+        f"{report['mesh']['num_triangles']} triangles "
+        f"({report['web']['num_triangles']} in web.glb), none further than "
+        f"{report['max_distance_m']:.2g} {short} from a point; glTF: {report['gltf']}, "
+        f"{report['level']}"
+    )
+    for warning in report["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    typer.echo(f"wrote {out}: mesh.ply, mesh.obj, mesh.glb, web.glb, mesh.json")
+
+
+def map_(
+    source: SourceArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    up: UpOption = None,
     resolution: Annotated[
         float | None,
         typer.Option(

@@ -11,8 +11,12 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.texture import Texture
 
 
-def import_open3d() -> ModuleType:
+def import_open3d(purpose: str = "rendering", extra: str = "render") -> ModuleType:
     """Open3D, imported when it is needed only.
+
+    Args:
+        purpose: what needs it, as the start of a sentence.
+        extra: of this package that installs it.
 
     Raises:
         MissingPackageError: the package or one of its system libraries is missing.
@@ -21,9 +25,9 @@ def import_open3d() -> ModuleType:
         import open3d
     except (ImportError, OSError) as error:
         raise MissingPackageError(
-            f"rendering needs the package open3d (pip install 'uwsfm[render]') and the "
-            f"system libraries libusb-1.0-0, libgomp1, libgl1, libegl1 and libx11-6, "
-            f"but importing it failed: {error}"
+            f"{purpose} needs the package open3d (pip install 'uwsfm[{extra}]') and "
+            "the system libraries libusb-1.0-0, libgomp1, libgl1, libegl1 and "
+            f"libx11-6, but importing it failed: {error}"
         ) from error
     return open3d
 

@@ -19,6 +19,8 @@ from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
 from uwsfm.surface.height_map import make_height_map
 from uwsfm.surface.las import write_las
 from uwsfm.surface.level import world_from_map
+from uwsfm.surface.mesh import decimated, distances_to_cloud, make_mesh
+from uwsfm.surface.mesh_files import write_glb, write_mesh_ply, write_obj
 from uwsfm.surface.packages import import_package
 from uwsfm.surface.preview import write_preview
 from uwsfm.surface.source import find_source
@@ -97,6 +99,67 @@ def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
     cloud = found.cloud()
     write_las(cloud, target, found.unit)
     return cloud
+
+
+def mesh_cloud(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    method: str = "poisson",
+    max_distance: float | None = None,
+    up: str | None = None,
+    web_triangles: int = 100_000,
+) -> dict[str, Any]:
+    """Write a mesh: mesh.ply, mesh.obj, mesh.glb, web.glb (decimated) and mesh.json.
+
+    Args:
+        source: result folder, or a PLY of its.
+        folder: to write; must not exist.
+        method: one of `uwsfm.surface.mesh.METHODS`.
+        max_distance: of the surface from the points; default: four of their spacings.
+        up: what is up in the world, for glTF; see `make_map`.
+        web_triangles: of the decimated copy, at most.
+
+    Returns:
+        What mesh.json holds.
+
+    Raises:
+        InputError: nothing to read, something to write over, or up is not known.
+        UwsfmError: there is no surface near the points.
+        MissingPackageError: Open3D is missing.
+    """
+    target = checked_target(folder)
+    if web_triangles < 1:
+        raise InputError(f"--web-triangles must be positive, got {web_triangles}")
+    found = find_source(source)
+    cloud = found.cloud()
+    level = found.level(cloud, up)
+    mesh, reach = make_mesh(cloud, method, max_distance, found.above(cloud))
+    small = decimated(mesh, web_triangles, cloud)
+    report: dict[str, Any] = {
+        "source": str(found.path),
+        "unit": found.unit,
+        "method": method,
+        "num_points": len(cloud),
+        "max_distance_m": reach,
+        "gltf": "metres, +y up" if found.unit == "metre" else "no metres, +y up",
+        "level": level.method,
+        "warnings": found.warnings(),
+    }
+    for name, part in (("mesh", mesh), ("web", small)):
+        report[name] = {
+            "num_vertices": len(part.vertices),
+            "num_triangles": len(part.triangles),
+            "area_m2": part.area(),
+            "farthest_from_points_m": float(distances_to_cloud(part, cloud).max()),
+        }
+    with replaced_dir(target) as partial:
+        write_mesh_ply(mesh, partial / "mesh.ply", found.unit)
+        write_obj(mesh, partial / "mesh.obj", found.unit)
+        write_glb(mesh, partial / "mesh.glb", level, found.unit)
+        write_glb(small, partial / "web.glb", level, found.unit)
+        write_json(report, partial / "mesh.json")
+    return report
 
 
 def make_map(

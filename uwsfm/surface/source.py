@@ -82,21 +82,27 @@ class Source:
     def level(self, cloud: Cloud, up: str | None) -> Level:
         """The level frame of its world, see `uwsfm.surface.level.find_level`.
 
-        Above the points are the cameras, or else where most normals point to.
-
         Raises:
             InputError: which way is up would be a guess.
         """
-        above, has_positions = None, False
+        has_positions = self.folder is not None and (
+            read_summary(self.folder).get("positions") is not None
+        )
+        above = self.above(cloud)
+        return find_level(up, cloud.points, above, has_positions=has_positions)
+
+    def above(self, cloud: Cloud) -> Array | None:
+        """A place (3,) on the cameras' side of the points: the cameras' middle, or far
+        off where most normals point to; None if neither is known."""
         if self.folder is not None:
             poses = read_model(self.folder).scene.rig_from_world
-            above = rigid3.inverse(poses)[:, 4:].mean(axis=0)
-            has_positions = read_summary(self.folder).get("positions") is not None
-        elif np.isfinite(cloud.normals).all(axis=1).any():
-            reach = np.nanmax(np.abs(cloud.points))
-            mean = np.nanmean(cloud.normals, axis=0)
-            above = np.nanmedian(cloud.points, axis=0) + 1e3 * reach * mean
-        return find_level(up, cloud.points, above, has_positions=has_positions)
+            return rigid3.inverse(poses)[:, 4:].mean(axis=0)
+        known = np.isfinite(cloud.normals).all(axis=1)
+        if not np.any(known):
+            return None
+        middle = np.nanmedian(cloud.points, axis=0)
+        reach = np.nanmax(np.abs(cloud.points - middle))
+        return middle + 1e3 * reach * cloud.normals[known].mean(axis=0)
 
     def warnings(self) -> list[str]:
         """What the user should know, one sentence each."""
