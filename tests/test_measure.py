@@ -214,6 +214,28 @@ def test_undetermined_is_said_and_no_number_given(opened):
     assert "nothing that is measured is determined" in found.warnings[0]
 
 
+def test_a_scale_that_is_arbitrary_is_said_with_every_length(opened, spots):
+    covariance = replace(opened.calibration.covariance, scale_stddev=None)
+    calibration = replace(opened.calibration, covariance=covariance)
+    unknown = replace(opened, calibration=calibration)
+    bar = {"ends": spots[1][:2], "length_m": 0.5}
+    found = uwsfm.measure(unknown, {"version": 1, "scale_bars": [bar]})
+    assert found.unit == "scale arbitrary" and "arbitrary unit" in found.warnings[0]
+    (entry,) = found.summary["measurements"]
+    assert entry["unit"] == "unit" and "no check" in entry["scale_bar"]["verdict"]
+    # What would make it metric is told all the same.
+    factor = found.scale_bars["known_over_measured"]
+    assert factor == pytest.approx(0.5 / entry["value"], rel=1e-12)
+    assert "no check" in found.scale_bars["verdict"]
+
+
+def test_a_bar_that_was_given_is_no_check(dive_result, opened):
+    given = yaml.safe_load((dive_result.out.parent / "lengths.yaml").read_text())
+    content = {"version": 1, "scale_bars": given["scale_bars"]}
+    (item,) = uwsfm.measure(opened, content).measurements
+    assert "no independent check" in item.notes[0]
+
+
 def test_words_and_digits():
     assert [agreement(r) for r in (-1.9, 3.0, -4.1)] == [
         "agrees",

@@ -5,12 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dense import dense_system, small_scene
+from test_outside import (
+    HOUSING_KNOWN,
+    bar,
+    dive,
+    one_camera,
+    positions,
+    scaled_start,
+    tracked,
+)
 
-from uwsfm import calibrate
+from uwsfm import Lengths, calibrate
 from uwsfm.calibration.places import misses, placed
 from uwsfm.calibration.propagation import FEATURE, Places, Propagation
-from uwsfm.calibration.uncertainty import clusters_of
+from uwsfm.calibration.uncertainty import clusters_of, scale_stddev
 from uwsfm.measuring.quantities import area, distance, height
+from uwsfm.simulate.rigs import paper_rig
+from uwsfm.simulate.trajectories import rich_motion, straight_strip
 from uwsfm.solver.covariance import point_covariances
 from uwsfm.solver.layout import build_layout
 
@@ -58,6 +69,53 @@ def test_the_optimum_is_opened_where_it_was_left(dive_result):
     )
     features = points[: calibration.scene.num_points]
     np.testing.assert_allclose(features, stored.points, rtol=1e-6, atol=1e-14)
+
+
+def one_camera_dive(known=None):
+    simulated = dive(one_camera(), rich_motion(8), num_points=150)
+    lengths = None if known is None else known(simulated.truth)
+    return calibrate(simulated.scene, lengths=lengths)
+
+
+def known_housing_dive():
+    poses = straight_strip(12, spacing=0.08, altitude=0.5)
+    return calibrate(dive(one_camera(0.12), poses).scene, **HOUSING_KNOWN)
+
+
+def tracked_dive(rig):
+    simulated = dive(rig, rich_motion(8), num_points=150)
+    found, _ = tracked(simulated.truth, np.random.default_rng(0), outliers=0.3)
+    return calibrate(scaled_start(simulated.scene), lengths=positions(found))
+
+
+OPTIMA = {
+    "scale held": one_camera_dive,
+    "scale by a bar": lambda: one_camera_dive(
+        lambda truth: Lengths(between_points=bar(truth))
+    ),
+    "scale by refraction": known_housing_dive,
+    "stereo among positions": lambda: tracked_dive(paper_rig()),
+    "one camera among positions": lambda: tracked_dive(one_camera()),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMA)
+def test_every_optimum_is_opened_where_it_was_left(name):
+    calibration = OPTIMA[name]()
+    stored, sigma = calibration.covariance, calibration.summary.sigma_px
+    found = Propagation(calibration)
+    assert found.determined == stored.determined
+    # Weights of priors are taken at what was found, not at what was given: 1e-6.
+    for again, before in (
+        (found._reduced.border[None], stored.border[None]),
+        (found._reduced.frames, stored.frames),
+    ):
+        spread = np.sqrt(np.einsum("fii->fi", before))
+        gap = np.abs(sigma**2 * again - before)
+        assert np.all(gap <= 1e-5 * spread[:, :, None] * spread[:, None])
+    if stored.scale_stddev is not None:
+        again = scale_stddev(found.optimum)
+        assert again == pytest.approx(stored.scale_stddev, rel=1e-5)
 
 
 def test_clicks_are_placed_where_they_fit_best(clicked):

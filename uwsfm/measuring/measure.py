@@ -112,7 +112,7 @@ def measure(
     )
     known = _Known(result, propagation, places, spotter.spots, both)
     items = tuple(
-        known.measurement(i, task, quantity, r)
+        known.measurement(i, task, quantity, r, spotter.entered(task))
         for i, (task, quantity, r) in enumerate(zip(tasks, found, rows, strict=True))
     )
     bars = known.scale_bars(items)
@@ -172,7 +172,7 @@ class _Known:
         return ()
 
     def measurement(
-        self, i: int, task: Task, quantity: Quantity, rows: Sequence[int]
+        self, i: int, task: Task, quantity: Quantity, rows: Sequence[int], entered: bool
     ) -> Measurement:
         unit = math.degrees(1.0) if task.kind == "angle" else 1.0
         stddevs = [unit * math.sqrt(c[i, i]) for c in self.both]
@@ -187,6 +187,8 @@ class _Known:
         notes = [spot.note for spot in spots if spot.note is not None]
         if not known:
             notes.insert(0, "not determined by the images")
+        elif task.length_m is not None and entered:
+            notes.append(_ENTERED)
         elif task.kind in ("distance", "polyline", "height", "area"):
             notes += _of_its_size(quantity.value, stddev)
         return Measurement(
@@ -242,6 +244,9 @@ class _Known:
         if self.scale_stddev is None:
             return "no check: the scale is arbitrary"
         return agreement(ratio)
+
+
+_ENTERED = "the adjustment was given this length: no independent check"
 
 
 def agreement(ratio: float) -> str:

@@ -101,6 +101,20 @@ class Spotter:
                 raise InputError(text) from None
         return rows
 
+    def entered(self, task: Task) -> bool:
+        """Whether a scale bar is one that the adjustment was given."""
+        bars = self.result.calibration.bars
+        if bars is None or not all(isinstance(p, PixelPick) for p in task.picks):
+            return False
+        columns = (bars.camera_idx.tolist(), bars.frame_idx.tolist(), *bars.xy.T)
+        known = set(zip(*columns, strict=True))
+        return all(
+            (*self._images[click.image], *click.xy) in known
+            for pick in task.picks
+            if isinstance(pick, PixelPick)
+            for click in pick.clicks
+        )
+
     @property
     def spots(self) -> Sequence[Spot]:
         return self._spots
