@@ -13,7 +13,9 @@ from test_cli import _one_sentence, run
 import uwsfm
 from uwsfm import InputError
 from uwsfm.cloud import Cloud, write_cloud
+from uwsfm.geometry import rigid3
 from uwsfm.measuring.measure import agreement
+from uwsfm.measuring.surface import Surface, SurfaceImage
 from uwsfm.measuring.table import rounded
 
 CLICK_PX = 0.5
@@ -153,6 +155,31 @@ def test_a_pixel_in_one_image_takes_the_depth_of_the_surface(dense):
     # A plane through twelve points a centimetre apart, of a floor that hardly bends.
     assert np.linalg.norm(item.points - ends, axis=1).max() < 1e-4
     assert all("depth of dense/cloud.ply" in spot.how for spot in item.spots)
+
+
+def test_a_pixel_sees_what_is_in_front_and_nothing_beside_an_edge(opened):
+    """A plate at half the distance hides the floor; beside its edge is neither."""
+    scene = opened.model.scene
+    pose = rigid3.inverse(scene.rig_from_world[0])
+    x, y = (c.ravel() for c in np.meshgrid(*2 * [np.linspace(-0.4, 0.4, 161)]))
+    floor = np.stack([x, y, np.full_like(x, 1.0)], axis=1)
+    plate = 0.5 * floor[x > 0.1]
+    surface = Surface(
+        rigid3.transform(pose, np.vstack([floor, plate])),
+        "a cloud",
+        np.full(99999, 1e-3),
+    )
+    image = SurfaceImage(surface, scene, 0, 0)
+    lens = scene.cameras[0]
+    for place in ([0.1, 0.0, 0.5], [-0.2, 0.1, 1.0]):
+        (xy,), _ = lens.img_from_point([place])
+        patch = image.patch(tuple(xy))
+        expected = rigid3.transform(pose, np.array(place))
+        np.testing.assert_allclose(patch.point, expected, atol=1e-9)
+        assert patch.relief < 1e-9 and patch.stddev == 1e-3
+    (edge,), _ = lens.img_from_point([[0.0495, 0.0, 0.5]])
+    with pytest.raises(InputError, match="the depth jumps there, from 0.5"):
+        image.patch(tuple(edge))
 
 
 def test_a_pixel_in_one_image_without_a_surface_is_refused(opened):

@@ -2,6 +2,8 @@
 
     python pipelines/uril_tank/pipeline.py DATA -o OUT        # writes OUT/run
     python pipelines/inspection/measuring.py --tank DATA/tank_corners.npz OUT/run
+    uwsfm dense OUT/run
+    python pipelines/inspection/measuring.py --tank ... OUT/run --one-image
     uwsfm demo -o DEMO
     python pipelines/inspection/measuring.py --sample DEMO
 
@@ -29,8 +31,17 @@ NUM_PLACES = 120
 CLICK_PX = 0.3
 
 
-def tank_bars(result: Result, corners_path: Path, click_px: float) -> dict:
-    """measurements.yaml: bars of several lengths on every board in view."""
+def tank_bars(
+    result: Result, corners_path: Path, click_px: float, sides: int = 2
+) -> dict:
+    """measurements.yaml: bars of several lengths on every board in view.
+
+    Args:
+        result: of the tank.
+        corners_path: tank_corners.npz.
+        click_px: noise of the corners.
+        sides: 1 for clicks in the left image alone.
+    """
     data = np.load(corners_path)
     columns, lines = (int(number) for number in data["board_inner"])
     bars = []
@@ -49,7 +60,7 @@ def tank_bars(result: Result, corners_path: Path, click_px: float) -> dict:
                         {
                             "name": str(step),
                             "length_m": step * SQUARE_M,
-                            "ends": [clicks_of(name, end) for end in ends],
+                            "ends": [clicks_of(name, end)[:sides] for end in ends],
                         }
                     )
     return {"version": 1, "click_stddev_px": click_px, "scale_bars": bars}
@@ -166,7 +177,14 @@ def main() -> None:
     what.add_argument("--tank", type=Path, help="tank_corners.npz")
     what.add_argument("--sample", action="store_true", help="the result is the demo's")
     parser.add_argument("result", type=Path)
+    parser.add_argument(
+        "--one-image",
+        action="store_true",
+        help="clicks in the left image alone, at the depth of RESULT/dense/cloud.ply",
+    )
     options = parser.parse_args()
+    if options.sample and options.one_image:
+        parser.error("--one-image goes with --tank")
     result = uwsfm.open_result(options.result)
     if options.sample:
         found = uwsfm.measure(result, sample_bars(result))
@@ -174,7 +192,8 @@ def main() -> None:
     else:
         # First with any noise, to see what it is.
         noise = click_noise(uwsfm.measure(result, tank_bars(result, options.tank, 1.0)))
-        found = uwsfm.measure(result, tank_bars(result, options.tank, noise))
+        sides = 1 if options.one_image else 2
+        found = uwsfm.measure(result, tank_bars(result, options.tank, noise, sides))
     bars = found.scale_bars
     assert bars is not None
     print(

@@ -18,8 +18,8 @@ from uwsfm.measuring.measurements_file import Task
 from uwsfm.measuring.picks import Pick, PixelPick, PointPick, WorldPick
 from uwsfm.measuring.surface import (
     Surface,
+    SurfaceImage,
     model_surface,
-    patch_below,
     surface_of,
     views_of,
 )
@@ -74,6 +74,7 @@ class Spotter:
         self._sources: list[int | _Rays] = []
         """Of each spot: a point of the model, or rays."""
         self._known: dict[tuple, int] = {}
+        self._last: tuple[tuple[int, int], SurfaceImage] | None = None
 
     @cached_property
     def surface(self) -> Surface:
@@ -213,9 +214,7 @@ class Spotter:
     ) -> tuple[Spot, _Rays]:
         """A pixel on the surface: it slides there as the click errs."""
         camera, frame, xy = self._clicks(pick, where)
-        patch = patch_below(
-            self.surface, self.scene, int(camera[0]), int(frame[0]), pick.clicks[0].xy
-        )
+        patch = self._image(int(camera[0]), int(frame[0])).patch(pick.clicks[0].xy)
         rays = self._seen(patch.point, patch.stddev)
         one = replace(self._observed(camera, frame, xy), points=patch.point[None])
         sliding = np.linalg.inv(np.vstack([pixels_by_point(one)[0], patch.normal]))
@@ -229,6 +228,13 @@ class Spotter:
             f"{patch.reach_px:.0f} px"
         )
         return Spot(pick, how, len(rays.xy)), rays
+
+    def _image(self, camera: int, frame: int) -> SurfaceImage:
+        """The last one is kept: clicks come image after image."""
+        if self._last is None or self._last[0] != (camera, frame):
+            image = SurfaceImage(self.surface, self.scene, camera, frame)
+            self._last = (camera, frame), image
+        return self._last[1]
 
     def _observed(self, camera: IndexArray, frame: IndexArray, xy: Array) -> Scene:
         return replace(

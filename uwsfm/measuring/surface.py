@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -22,6 +22,10 @@ NEIGHBOURS = 12
 """Points that tell the surface below a pixel."""
 MAX_REACH = 0.03
 """Of the image's width: points farther from the pixel tell nothing of its surface."""
+CANDIDATES = 3 * NEIGHBOURS
+"""Points behind a surface, which it hides, are among the nearest."""
+AROUND = 0.6
+"""How far the middle of points around a pixel is from it, at most, in their reach."""
 DEPTH_STEP = 0.05
 """Points that differ more in range are on something else."""
 AWAY = 5.0
@@ -38,7 +42,6 @@ class Surface:
     name: str
     stddev: Array | None = None
     """(P,) along the line of sight, metres; None: points of the model."""
-    width: int = field(default=NEIGHBOURS)
 
     @property
     def is_model(self) -> bool:
@@ -54,7 +57,7 @@ class Surface:
         Raises:
             InputError: the place is not on the cloud.
         """
-        gaps, rows = self.tree.query(xyz, k=min(self.width, len(self.points)))
+        gaps, rows = self.tree.query(xyz, k=min(NEIGHBOURS, len(self.points)))
         spacing = float(np.median(self.tree.query(self.points[rows], k=2)[0][:, 1]))
         if not gaps[0] <= AWAY * spacing:
             raise InputError(
@@ -102,56 +105,73 @@ def model_surface(scene: Scene) -> Surface:
     return Surface(scene.points, "the sparse model")
 
 
-def patch_below(
-    surface: Surface, scene: Scene, camera: int, frame: int, xy: tuple[float, float]
-) -> Patch:
-    """Where the ray of a pixel meets the surface.
+class SurfaceImage:
+    """A surface as one image of the model sees it."""
 
-    Raises:
-        InputError: there is no surface there, or its depth jumps.
-    """
-    lens = scene.cameras[camera]
-    pose = rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world[frame])
-    in_cam = rigid3.transform(pose, surface.points)
-    pixels, valid = lens.img_from_point(in_cam)
-    gaps = np.where(valid, np.linalg.norm(pixels - xy, axis=1), np.inf)
-    rows = np.argsort(gaps)[:NEIGHBOURS]
-    limit = MAX_REACH * lens.width
-    if not gaps[rows[-1]] <= limit:
-        count = int(np.count_nonzero(gaps <= limit))
-        raise InputError(
-            f"{surface.name} has {count} points within {limit:.0f} px of the pixel, "
-            f"its surface takes {NEIGHBOURS}: click the spot in a second image"
+    def __init__(self, surface: Surface, scene: Scene, camera: int, frame: int) -> None:
+        self.surface, self.lens = surface, scene.cameras[camera]
+        placement, pose = scene.cam_from_rig[camera], scene.rig_from_world[frame]
+        self.cam_from_world = rigid3.compose(placement, pose)
+        in_cam = rigid3.transform(self.cam_from_world, surface.points)
+        pixels, valid = self.lens.img_from_point(in_cam)
+        self.rows = np.flatnonzero(valid)
+        self.ranges = np.linalg.norm(in_cam[valid], axis=1)
+        self.pixels = pixels[valid]
+        self.tree = cKDTree(self.pixels)
+
+    def patch(self, xy: tuple[float, float]) -> Patch:
+        """Where the ray of a pixel meets the surface.
+
+        Raises:
+            InputError: there is no surface there, or its depth jumps.
+        """
+        chosen = self._front(xy)
+        near = self.surface.points[self.rows[chosen]]
+        origin, sight = _ray_in_world(self.lens, self.cam_from_world, xy)
+        middle = near.mean(axis=0)
+        normal = np.linalg.svd(near - middle)[2][2]
+        facing = float(normal @ sight)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = (near - middle) @ normal / facing
+        if not np.all(np.abs(off) < DEPTH_STEP * self.ranges[chosen]):
+            raise InputError(f"the surface is seen edge-on there: {_TWICE}")
+        stddev = self.surface.stddev
+        stated = np.nan if stddev is None else np.median(stddev[self.rows[chosen]])
+        along = float(normal @ (middle - origin)) / facing
+        return Patch(
+            point=origin + along * sight,
+            normal=normal,
+            sight=sight,
+            relief=float(np.sqrt(np.mean(off**2))),
+            reach_px=float(np.linalg.norm(self.pixels[chosen] - xy, axis=1).max()),
+            stddev=float(stated),
         )
-    ranges = np.linalg.norm(in_cam[rows], axis=1)
-    if np.any(np.abs(ranges / np.median(ranges) - 1.0) > DEPTH_STEP):
-        raise InputError(
-            f"the depth jumps there, from {ranges.min():.3g} to {ranges.max():.3g} m "
-            "around the pixel: click the spot in a second image"
-        )
-    near = surface.points[rows]
-    origin, sight = _ray_in_world(lens, pose, xy)
-    middle = near.mean(axis=0)
-    normal = np.linalg.svd(near - middle)[2][2]
-    facing = float(normal @ sight)
-    off = (near - middle) @ normal / facing if facing else np.full(len(near), np.inf)
-    stated = (
-        np.nan if surface.stddev is None else float(np.median(surface.stddev[rows]))
-    )
-    # With points nearly on a line the plane may hold the ray: the middle's depth then.
-    if not np.all(np.abs(off) < DEPTH_STEP * ranges):
-        raise InputError(
-            "the surface is seen edge-on there: click the spot in a second image"
-        )
-    along = float(normal @ (middle - origin)) / facing
-    return Patch(
-        point=origin + along * sight,
-        normal=normal,
-        sight=sight,
-        relief=float(np.sqrt(np.mean(off**2))),
-        reach_px=float(gaps[rows[-1]]),
-        stddev=stated,
-    )
+
+    def _front(self, xy: tuple[float, float]) -> IndexArray:
+        """The nearest points around a pixel that nothing hides."""
+        limit = MAX_REACH * self.lens.width
+        gaps, found = self.tree.query(xy, k=CANDIDATES, distance_upper_bound=limit)
+        found = found[np.isfinite(gaps)]
+        if len(found) < NEIGHBOURS:
+            raise InputError(
+                f"{self.surface.name} has {len(found)} points within {limit:.0f} px of "
+                f"the pixel, its surface takes {NEIGHBOURS}: {_TWICE}"
+            )
+        ranges = self.ranges[found]
+        front = found[ranges <= (1.0 + DEPTH_STEP) * ranges.min()][:NEIGHBOURS]
+        # Beside an edge they are all on one side of the pixel.
+        offset = self.pixels[front] - xy
+        aside = np.linalg.norm(offset.mean(axis=0))
+        reach = np.linalg.norm(offset, axis=1).max()
+        if len(front) < NEIGHBOURS or aside > AROUND * reach:
+            raise InputError(
+                f"the depth jumps there, from {ranges.min():.3g} to {ranges.max():.3g} "
+                f"m around the pixel: {_TWICE}"
+            )
+        return front
+
+
+_TWICE = "click the spot in a second image"
 
 
 def _ray_in_world(lens, pose: Array, xy: tuple[float, float]) -> tuple[Array, Array]:
