@@ -35,6 +35,7 @@ from uwsfm.solver.layout import HELD, Layout, build_layout
 from uwsfm.solver.levenberg_marquardt import suitable_blas
 from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.reduction import analyse
+from uwsfm.solver.terms import skew_matrices
 
 FEATURE = -1
 
@@ -231,7 +232,7 @@ def _pull(layout: Layout, eqs: NormalEquations, rows: IndexArray) -> sp.csr_arra
         cells = np.arange(layout.point_start[p], layout.point_start[p + 1])
         first = layout.frame_col[layout.cell_frame[cells]]
         free = first != HELD
-        blocks = eqs.cells[cells[free]].reshape(-1, 3)  # (6 cells, 3)
+        blocks = _frame_against_point(eqs.cells[cells[free]])  # (6 cells, 3)
         col = (first[free, None] + np.arange(6)).ravel()
         both = np.vstack([blocks, eqs.points_border[p].T])
         columns += 3 * [np.append(col, border)]
@@ -245,6 +246,13 @@ def _pull(layout: Layout, eqs: NormalEquations, rows: IndexArray) -> sp.csr_arra
         ),
         shape=(3 * len(rows), size),
     )
+
+
+def _frame_against_point(cells: Array) -> Array:
+    """W (6 k, 3) = [[q]x H R; H R] of cells (k, 4, 3), as the equations keep them."""
+    lower, in_rig = cells[:, :3], cells[:, 3]
+    upper = skew_matrices(in_rig) @ lower
+    return np.concatenate([upper, lower], axis=1).reshape(-1, 3)
 
 
 def _inverses(normal: Array) -> Array:
