@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 import yaml
 from result_folders import clicks
-from test_cli import _one_sentence, run
+from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm import InputError
+from uwsfm.cli import app
 from uwsfm.cloud import Cloud, write_cloud
+from uwsfm.console import console
 from uwsfm.geometry import rigid3
 from uwsfm.measuring.measure import agreement
 from uwsfm.measuring.surface import Surface, SurfaceImage
-from uwsfm.measuring.table import rounded
+from uwsfm.measuring.table import measurement_table, rounded
 
 CLICK_PX = 0.5
 
@@ -273,21 +275,36 @@ def test_words_and_digits():
     assert rounded(1234.5, 120.0) == "1234 ± 120"
 
 
-def test_command_line(dive_result, spots, tmp_path):
+def test_command_line(dive_result, spots, tmp_path, capsys):
     out, report = str(dive_result.out), tmp_path / "m.json"
     known = np.linalg.norm(spots[0][0] - spots[0][1])
     ends = [
         "+".join(f"{c['image']}:{c['xy'][0]},{c['xy'][1]}" for c in clicked)
         for clicked in spots[1][:2]
     ]
-    found = run(
-        "measure", out, "--from", ends[0], "--to", ends[1],
-        "--known", f"{known:.5f}", "--click-stddev", "0.5", "-o", str(report),
-    )  # fmt: skip
-    assert found.returncode == 0, found.stderr
-    assert "agrees" in found.stdout and "±" in found.stdout
+    found = CliRunner().invoke(
+        app,
+        ["measure", out, "--from", ends[0], "--to", ends[1], "--click-stddev", "0.5"]
+        + ["--known", f"{known:.5f}", "-o", str(report)],
+        catch_exceptions=False,
+    )
+    assert found.exit_code == 0 and f"wrote {report}" in found.output
     assert json.loads(report.read_text())["measurements"][0]["kind"] == "scale bar"
-    file = tmp_path / "measurements.yaml"
-    file.write_text(yaml.safe_dump({"version": 1, "areas": [{"corners": [1, 2]}]}))
-    failed = run("measure", out, str(file))
-    _one_sentence(failed, "areas[0].corners: needs 3 values, got 2")
+    console.print(measurement_table(uwsfm.measure(out, {"version": 1, **AREA})))
+    assert "cm2" in capsys.readouterr().out
+
+
+AREA = {"areas": [{"name": "floor", "corners": [1, 5, 9]}]}
+
+
+def test_command_line_wants_one_thing(dive_result, tmp_path):
+    out, file = str(dive_result.out), tmp_path / "m.yaml"
+    file.write_text(yaml.safe_dump({"version": 1, **AREA}))
+    for arguments, words in (
+        (["--from", "1"], "a measurements.yaml, or --from and --to"),
+        ([str(file), "--to", "1"], "says what to measure: --from, --to"),
+    ):
+        with pytest.raises(InputError, match=words):
+            CliRunner().invoke(
+                app, ["measure", out, *arguments], catch_exceptions=False
+            )
