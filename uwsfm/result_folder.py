@@ -17,6 +17,9 @@ from uwsfm.export.calibration_file import (
 )
 from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model
 
+DENSE_CLOUD = "dense/cloud.ply"
+"""Where `uwsfm dense` leaves its cloud."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Result:

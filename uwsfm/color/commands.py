@@ -25,10 +25,9 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import POINTS, checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.export.warp import read_image, write_image
-from uwsfm.result_folder import Result, open_result
+from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
 WATER = "water.json"
-DENSE_CLOUD = "dense/cloud.ply"
 STATED = "colours without the water, by uwsfm color"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,10 +12,8 @@ from uwsfm.cloud import read_cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import Result
+from uwsfm.result_folder import DENSE_CLOUD, Result
 from uwsfm.scene import IndexArray, Scene
-
-DENSE_CLOUD = Path("dense") / "cloud.ply"
 
 NEIGHBOURS = 12
 """Points that tell the surface below a pixel."""
@@ -96,7 +93,7 @@ def surface_of(result: Result) -> Surface:
         cloud = read_cloud(path)
         if len(cloud) < NEIGHBOURS:
             raise InputError(f"{path} has {len(cloud)} points only")
-        return Surface(cloud.points, str(DENSE_CLOUD), cloud.stddev)
+        return Surface(cloud.points, DENSE_CLOUD, cloud.stddev)
     return model_surface(result.model.scene)
 
 

@@ -13,9 +13,8 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import POINTS, SPARSE, SUMMARY, read_model, unit_of_model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.result_folder import DENSE_CLOUD
 from uwsfm.surface.level import Level, find_level
-
-DENSE_CLOUD = "dense/cloud.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
