@@ -53,10 +53,13 @@ def write_recording(out: str | Path, images: str | Path | None = None) -> Path:
     """
     rerun = import_rerun()
     result = open_result(out, images)
-    stream = rerun.RecordingStream("uwsfm", recording_id=str(result.folder.resolve()))
+    stream = rerun.RecordingStream("uwsfm", recording_id=result.folder.resolve().name)
     path = result.folder / RECORDING
     with replaced_file(path) as partial:
         stream.save(partial)
+        if result.summary["positions"] is None:  # the world is the first rig
+            axes = rerun.ViewCoordinates.RDF
+            rerun.log("world", axes, static=True, recording=stream)
         _log_world(rerun, stream, result.model)
         for index in range(len(result.model.rig.cameras)):
             _log_camera(rerun, stream, result, index)
