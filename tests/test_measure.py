@@ -136,6 +136,19 @@ def test_places_of_a_dense_cloud_are_measured(dense):
         )
 
 
+def test_a_cloud_of_an_earlier_model_is_refused(dense):
+    opened, surface = dense
+    place = ",".join(f"{v:.4f}" for v in surface[1200])
+    summary = opened.folder / "dense" / "summary.json"
+    content = {"version": 1, "distances": [{"ends": [1, place]}]}
+    summary.write_text(json.dumps({"model": opened.fingerprint}))
+    assert uwsfm.measure(opened, content).measurements[0].value > 0.0
+    summary.write_text(json.dumps({"model": "another"}))
+    with pytest.raises(InputError, match="is of an earlier model: run uwsfm dense"):
+        uwsfm.measure(opened, content)
+    summary.unlink()
+
+
 def test_a_pixel_in_one_image_takes_the_depth_of_the_surface(dense):
     opened, surface = dense
     scene = opened.model.scene

@@ -34,6 +34,8 @@ class Result:
     images: Path | None
     """Folder that holds one folder of images per camera; None if it is not known, or
     no longer there."""
+    fingerprint: str
+    """Of the model and the housing: what is made of them later names it."""
 
     @property
     def unit(self) -> str:
@@ -89,6 +91,7 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
         calibration=calibration,
         summary=summary,
         images=_image_folder(model, images, summary.get("images")),
+        fingerprint=mark,
     )
 
 

@@ -132,6 +132,7 @@ class _Run:
         write_cloud(cloud, folder / CLOUD, unit)
         summary = {
             "cloud": CLOUD,
+            "model": self.result.fingerprint,
             "num_points": len(cloud),
             "unit": unit,
             "voxel": voxel,
