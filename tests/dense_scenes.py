@@ -78,7 +78,7 @@ def dense_dive(folder: Path, num_frames: int = 3) -> DenseDive:
     model = model_of(rig, truth)
     export_colmap(model, folder / "model")
     dump_rig(rig, folder / "rig.yaml")
-    refine_model(folder / "model", folder / "rig.yaml", folder / "out")
+    refine_model(folder / "model", folder / "rig.yaml", folder / "out", report=False)
     plane = Plane(np.array([0.0, 0.0, 1.0]), 0.0, 0.004)
     for frame, pose in enumerate(truth.rig_from_world):
         for c, camera in enumerate(truth.cameras):

@@ -112,7 +112,9 @@ def test_scale_arbitrary_is_said_wherever_a_length_is(mono, tmp_path):
 def test_clicked_scale_bar_makes_one_camera_metric(mono, tmp_path, rng):
     bar = scale_bar(mono.truth, ["left"], rng, click_px=1.0)
     file = lengths_yaml(tmp_path / "lengths.yaml", scale_bars=[bar])
-    result = uwsfm.refine_model(mono.model, mono.rig, tmp_path / "out", lengths=file)
+    result = uwsfm.refine_model(
+        mono.model, mono.rig, tmp_path / "out", lengths=file, report=False
+    )
     stddev = result.summary["scale"]["relative_stddev"]
     assert 1e-3 < stddev < 0.02 and result.summary["scale"]["unit"] == "metre"
     assert abs(scale_of(result, mono.truth) - 1.0) < 3.0 * stddev
@@ -142,7 +144,9 @@ def test_distance_of_frames_makes_one_camera_metric(mono, tmp_path):
     length = float(np.linalg.norm(origins[11] - origins[8]))
     known = {"frames": ["0011.jpg", "0008.jpg"], "length_m": length, "stddev_m": 0.005}
     file = lengths_yaml(tmp_path / "lengths.yaml", frame_distances=[known])
-    result = uwsfm.refine_model(mono.model, mono.rig, tmp_path / "out", lengths=file)
+    result = uwsfm.refine_model(
+        mono.model, mono.rig, tmp_path / "out", lengths=file, report=False
+    )
     stddev = result.summary["scale"]["relative_stddev"]
     assert stddev == pytest.approx(0.005 / length, rel=1.0)
     assert abs(scale_of(result, mono.truth) - 1.0) < 4.0 * stddev
@@ -180,7 +184,7 @@ def test_a_bar_that_contradicts_the_baseline_is_told(tmp_path, rng):
     bar = {**bar, "length_m": 1.05 * bar["length_m"], "click_stddev_px": 0.2}
     file = lengths_yaml(tmp_path / "lengths.yaml", scale_bars=[bar])
     result = uwsfm.refine_model(
-        model, tmp_path / "rig.yaml", tmp_path / "out", lengths=file
+        model, tmp_path / "rig.yaml", tmp_path / "out", lengths=file, report=False
     )
     told = [w for w in result.summary["warnings"] if "known length 1" in w]
     assert len(told) == 1 and "contradicts" in told[0]
@@ -256,7 +260,9 @@ def test_unknown_names_are_refused_before_anything_is_written(mono, tmp_path, rn
     def refused(words, **content):
         file = lengths_yaml(tmp_path / "lengths.yaml", **content)
         with pytest.raises(InputError, match=words):
-            uwsfm.refine_model(mono.model, mono.rig, tmp_path / "out", lengths=file)
+            uwsfm.refine_model(
+                mono.model, mono.rig, tmp_path / "out", lengths=file, report=False
+            )
 
     bar = scale_bar(mono.truth, ["left"], rng)
     other = {**bar, "ends": [[{"image": "up/1.jpg", "xy": [1, 1]}] * 2, bar["ends"][1]]}

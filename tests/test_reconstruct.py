@@ -109,6 +109,7 @@ def test_second_run_starts_from_what_is_on_disk(demo):
         sample / "images",
         out,
         progress=lambda step, done, total: steps.append(step),
+        report=False,
     )
     assert not {"features", "matching", "mapping"} & set(steps)
     np.testing.assert_array_equal(again.model.scene.points, result.model.scene.points)

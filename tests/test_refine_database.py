@@ -67,7 +67,7 @@ def test_lost_frames_and_images_are_registered_from_all_matches(dive, tmp_path):
     found = self_calibrated(dive.model, without=lambda c, f: (c, f) in LOST)
     write(found, tmp_path / "model", old=True)
     result = uwsfm.refine_model(
-        tmp_path / "model", dive.rig, tmp_path / "out", database=database
+        tmp_path / "model", dive.rig, tmp_path / "out", database=database, report=False
     )
     assert database.read_bytes() == content
     assert result.summary["num_registered_frames"] == NUM_FRAMES
@@ -118,6 +118,10 @@ def test_a_database_that_is_not_of_the_model_is_refused(dive, tmp_path, what):
         words = "is not a COLMAP database"
     with pytest.raises(uwsfm.InputError, match=words):
         uwsfm.refine_model(
-            tmp_path / "model", dive.rig, tmp_path / "out", database=database
+            tmp_path / "model",
+            dive.rig,
+            tmp_path / "out",
+            database=database,
+            report=False,
         )
     assert not (tmp_path / "out").exists()

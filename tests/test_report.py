@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import shlex
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +95,15 @@ def test_a_report_that_fails_costs_no_result(dive_result, tmp_path):
     assert str(mine.parent) in written["warnings"][-1]
 
 
+def test_a_result_without_a_report_has_none_of_an_earlier_run(dive_result, tmp_path):
+    result = dive_result.result
+    shutil.copytree(dive_result.out / FOLDER, tmp_path / FOLDER)
+    (tmp_path / PAGE).write_text("of an earlier run")
+    summary = dict(result.summary)
+    write_with_report(tmp_path, result.model, result.calibration, summary, wanted=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
+
+
 def test_report_of_what_is_no_result_is_refused(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         uwsfm.write_report(tmp_path / "nowhere")
@@ -117,6 +127,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
         "num_threads": -1,
         "submap_frames": None,
         "scheduler": "local",
+        "report": False,
         "progress": print,
         "calibration": {"refine_water_index": True, "water_index_stddev": 0.002},
     }
@@ -127,6 +138,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
     found = parsed.params
     assert found["rig"] == asked["rig"] and found["clahe"] is True
     assert found["matching"] == "sequential" and found["seed"] == 3
+    assert found["report"] is False and found["threads"] == -1
     assert found["lever_arm"] == "-0.2,0,1.5" and found["scene_distance"] == 2.5
     assert [item.value for item in found["also"]] == ["water-index"]
     assert found["prior"] == ["water_index_stddev=0.002"]

@@ -24,7 +24,7 @@ def near(tmp_path_factory) -> Path:
 
 def reconstructed(near: Path, out: Path, **options) -> Comparison:
     result = uwsfm.reconstruct(
-        near / "rig.yaml", near / "images", out, seed=1, **options
+        near / "rig.yaml", near / "images", out, seed=1, **options, report=False
     )
     return compare_with_truth(result, near / "truth.json")
 

@@ -93,6 +93,7 @@ def test_where_no_scheduler_is_nothing_is_written(
             sample_dir() / "images",
             tmp_path / "out",
             scheduler=scheduler,
+            report=False,
         )
     assert not (tmp_path / "out").exists()
 

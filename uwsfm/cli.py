@@ -22,6 +22,7 @@ from uwsfm.cli_options import (
     PositionsOption,
     PriorOption,
     RefineOption,
+    ReportOption,
     SceneDistanceOption,
     SchedulerOption,
     lever_arm_of,
@@ -149,6 +150,7 @@ def reconstruct(
         ),
     ] = None,
     scheduler: SchedulerOption = "local",
+    report: ReportOption = True,
 ) -> None:
     """Reconstruct a dive: images and a rig file in, a metric model out.
 
@@ -175,6 +177,7 @@ def reconstruct(
             num_threads=threads,
             submap_frames=submap_frames,
             scheduler=scheduler,
+            report=report,
             progress=progress,
             **wanted_of(also or ()),
             **priors_of(prior or ()),
@@ -282,6 +285,7 @@ def refine(
     scene_distance: SceneDistanceOption = 1.0,
     also: RefineOption = None,
     prior: PriorOption = None,
+    report: ReportOption = True,
 ) -> None:
     """Turn a COLMAP model that was made without refraction into the refractive one.
 
@@ -302,6 +306,7 @@ def refine(
             lengths=lengths,
             database=database,
             scene_distance_m=scene_distance,
+            report=report,
             progress=progress,
             **wanted_of(also or ()),
             **priors_of(prior or ()),

@@ -55,6 +55,9 @@ SchedulerOption = Annotated[
         "scheduler, which must see all folders under the same paths.",
     ),
 ]
+ReportOption = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write report.html.")
+]
 PositionsOption = Annotated[
     Path | None,
     typer.Option(

@@ -69,6 +69,7 @@ class OptionsEntry(Entry):
     prior: PriorEntry | None = None
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
     submap_frames: Annotated[int, Field(ge=10)] | None = None
+    report: bool | None = None
 
 
 class DiveEntry(Entry):

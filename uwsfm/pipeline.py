@@ -88,6 +88,7 @@ def reconstruct(
     num_threads: int = -1,
     submap_frames: int | None = None,
     scheduler: str = LOCAL,
+    report: bool = True,
     progress: Progress = silent,
     **calibration: Any,
 ) -> ReconstructResult:
@@ -120,6 +121,7 @@ def reconstruct(
             which are merged; None: in parts of 200 beyond 400.
         scheduler: Who maps the parts: "local", or the address of a Dask scheduler whose
             workers see ``images`` and ``out`` under the same paths.
+        report: False: no ``report.html``, which takes a second or two.
         progress: Called with each long step.
         **calibration: Fields of `CalibrateOptions`, of the last adjustment.
 
@@ -151,7 +153,15 @@ def reconstruct(
         pass
     with locked(out):
         job = _Job(
-            rig, Path(images), out, options, known, calibration, command, progress
+            rig=rig,
+            images=Path(images),
+            out=out,
+            options=options,
+            known=known,
+            calibration=calibration,
+            command=command,
+            report=report,
+            progress=progress,
         )
         return job.run()
 
@@ -167,6 +177,7 @@ class _Job:
     known: KnownLengths
     calibration: Mapping[str, Any]
     command: str | None
+    report: bool
     progress: Progress
 
     def run(self) -> ReconstructResult:
@@ -189,7 +200,8 @@ class _Job:
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
         summary["command"] = self.command
-        write_with_report(out, model, refined.calibration, summary, self.progress)
+        found = refined.calibration
+        write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(
             model=model,
             calibration=refined.calibration,

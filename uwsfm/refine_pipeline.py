@@ -93,6 +93,7 @@ def refine_model(
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
+    report: bool = True,
     progress: Progress = silent,
     **options: Any,
 ) -> RefineResult:
@@ -117,7 +118,7 @@ def refine_model(
             matches, and frames that the model lacks are registered. It is not changed.
         scene_distance_m: Of a single camera's scene, about: without a baseline it sets
             the scale to start with.
-        positions, lever_arm, lengths: As in `reconstruct`.
+        positions, lever_arm, lengths, report: As in `reconstruct`.
         progress: Called with each long step.
         **options: Fields of `CalibrateOptions`.
 
@@ -152,7 +153,9 @@ def refine_model(
     known.check_names(rig, names)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out):
-        job = _Job(rig, start, matches, known, images, out, command, progress, timings)
+        job = _Job(
+            rig, start, matches, known, images, out, command, report, progress, timings
+        )
         return job.run(options)
 
 
@@ -202,6 +205,7 @@ class _Job:
     images: Path | None
     out: Path
     command: str | None
+    report: bool
     progress: Progress
     timings: dict[str, float]
 
@@ -230,7 +234,9 @@ class _Job:
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
         summary["command"] = self.command
         calibration = refined.calibration
-        write_with_report(self.out, model, calibration, summary, self.progress)
+        write_with_report(
+            self.out, model, calibration, summary, self.progress, wanted=self.report
+        )
         return RefineResult(
             model=model,
             calibration=refined.calibration,

@@ -45,7 +45,9 @@ def command_line(
 def _option(name: str, value: Any, default: Any) -> list[str] | None:
     flag = f"--{_NAMES.get(name, name).replace('_', '-')}"
     if isinstance(value, bool):
-        return [flag] if value and not default else []
+        if value == default:
+            return []
+        return [flag] if value else [flag.replace("--", "--no-", 1)]
     if isinstance(value, (str, Path, int, float)):
         return [] if value == default else [flag, str(value)]
     # A lever arm; joined by "=", as it may begin with a minus.

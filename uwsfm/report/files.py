@@ -1,5 +1,6 @@
 """report.html and the folder report/, as files of an output folder."""
 
+import shutil
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -39,8 +40,12 @@ def write_with_report(
     calibration: CalibrationResult,
     summary: dict[str, Any],
     progress: Progress = silent,
+    *,
+    wanted: bool = True,
 ) -> None:
     """Write summary.json and then the report, which may fail without losing a result.
+
+    A report of an earlier run does not stay beside a result that it is not of.
 
     Args:
         out: The output folder; all else is there already.
@@ -48,19 +53,29 @@ def write_with_report(
         calibration: Of its scene.
         summary: Gets the time that the report took, and a warning if it failed.
         progress: Called with the step "report".
+        wanted: Whether to write one.
     """
     write_json(summary, out / SUMMARY)
+    if not wanted:
+        _remove(out)
+        return
     progress("report", 0, None)
     clock = time.perf_counter()
     try:
         write_files(out, model, calibration.covariance, summary)
     except Exception as error:  # whatever it is, the result is worth more
-        with suppress(OSError):
-            (out / PAGE).unlink(missing_ok=True)  # it would be that of an earlier run
+        _remove(out)
         why = f"{error}" if isinstance(error, InputError) else repr(error)
         summary["warnings"].append(f"the report could not be written: {why}")
     summary["timings_s"]["report"] = time.perf_counter() - clock
     write_json(summary, out / SUMMARY)
+
+
+def _remove(out: Path) -> None:
+    with suppress(OSError):
+        (out / PAGE).unlink(missing_ok=True)
+    if (out / FOLDER / NUMBERS).is_file():
+        shutil.rmtree(out / FOLDER, ignore_errors=True)
 
 
 def write_files(
