@@ -39,6 +39,10 @@ def test_refine_writes_a_page_that_says_what_the_summary_says(dive_result):
     assert "known lengths" in verdict.metric and verdict.metric in page
     for port in verdict.ports:
         assert port.text in page
+    for known in summary["known_lengths"]:
+        assert (
+            f"{(known['found_m'] - known['given_m']) / known['stddev_m']:+.1f}" in page
+        )
     for camera in summary["cameras"]:
         assert f"tilt {camera['normal_verdict']}" in page
         assert f"distance {camera['distance_verdict']}" in page

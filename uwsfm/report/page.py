@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm.report.gather import Report, plain
 from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
-from uwsfm.report.words import deviation
+from uwsfm.report.words import deviation, known_length_rows, position_words
 
 _BADGES = {
     "determined": "good",
@@ -62,6 +62,8 @@ def page_of(report: Report) -> str:
         written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
         systematic=_systematic_words(report),
+        known_lengths=known_length_rows(summary),
+        positions=position_words(summary),
         view_caption=_view_caption(report),
         residual_words=[_residual_words(camera) for camera in report.residuals],
         pinhole_models=_pinhole_models(report),

@@ -91,6 +91,39 @@ def tilts_deg(normal: list[float]) -> tuple[float, float]:
     return x, y
 
 
+def known_length_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Given, its standard deviation, found, difference, millimetres; and the latter in
+    standard deviations of what was given."""
+    rows = []
+    for row in summary.get("known_lengths") or ():
+        given, stddev, found = row["given_m"], row["stddev_m"], row["found_m"]
+        first, second, miss = (
+            rounded(value, stddev, 1e3) for value in (given, found, found - given)
+        )
+        sigmas = f"{(found - given) / stddev:+.1f}"
+        rows.append((first, deviation(stddev, 1e3), second, miss, sigmas))
+    return rows
+
+
+def position_words(summary: dict[str, Any]) -> str | None:
+    """What came of positions of the frames; None if none were given."""
+    found = summary.get("positions")
+    if found is None:
+        return None
+    wrong = found["outliers"]
+    place = ", ".join(f"{value:.2g}" for value in found["place_stddev_m"])
+    text = (
+        f"{found['num_positions'] - len(wrong)} of {found['num_positions']} positions "
+        f"are used; they miss the model by {found['rms_miss_m']:.3g} m RMS, "
+        f"{found['scatter']:.2g} times what their standard deviations say. The model's "
+        f"place is known to {place} m, its turn to {found['turn_stddev_deg']:.2g} deg."
+    )
+    if wrong:
+        names = ", ".join(wrong[:10]) + (" ..." if len(wrong) > 10 else "")
+        text += f" Left out: {names}."
+    return text
+
+
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '?')) else '.'}"
 
