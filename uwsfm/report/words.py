@@ -94,7 +94,7 @@ def tilts_deg(normal: list[float]) -> tuple[float, float]:
 def known_length_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Given, its standard deviation, found, difference, millimetres; and the latter in
     standard deviations of what was given."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for row in summary.get("known_lengths") or ():
         given, stddev, found = row["given_m"], row["stddev_m"], row["found_m"]
         first, second, miss = (
