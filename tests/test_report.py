@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import typer
+from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm import InputError
@@ -222,3 +223,13 @@ def test_what_other_commands_left_is_named(dive_result, tmp_path):
         "measured.json",
     ]
     assert '<a href="my%20reef.glb">my reef.glb</a>' in page_of(report)
+
+
+def test_view_tells_where_the_page_is(dive_result, tmp_path):
+    runner = CliRunner()
+    found = runner.invoke(app, ["view", str(dive_result.out), "--no-open"])
+    assert found.exit_code == 0 and str(dive_result.out / PAGE) in found.output
+    found = runner.invoke(app, ["view", str(tmp_path), "--no-open"])
+    assert isinstance(found.exception, InputError)
+    found = runner.invoke(app, ["view", str(dive_result.out), "--images", "x"])
+    assert isinstance(found.exception, InputError) and "--rerun" in str(found.exception)

@@ -30,6 +30,7 @@ class Opened:
         self.page = chromium.new_page(
             viewport={"width": width, "height": 900}, color_scheme=scheme
         )
+        self.page.set_default_timeout(120_000)  # busy machines draw slowly
         self.errors: list[str] = []
         self.requests: list[str] = []
         self.page.on("console", self._console)
@@ -37,7 +38,7 @@ class Opened:
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.address = path.resolve().as_uri()
         self.page.goto(self.address)
-        self.page.wait_for_selector("html[data-drawn=yes]", timeout=60_000)
+        self.page.wait_for_selector("html[data-drawn=yes]")
 
     def _console(self, message) -> None:
         if message.type == "error":
