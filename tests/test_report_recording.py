@@ -44,10 +44,10 @@ def test_rays_bend_at_the_port_and_end_at_their_points(camera: RefractiveCamera,
     assert np.all(sine > 1e-4)  # off the axes of both ports
 
 
-def test_a_missing_rerun_is_named(dive_result, monkeypatch):
+def test_a_missing_rerun_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingPackageError, match=r"rerun-sdk.*uwsfm\[rerun\]"):
-        write_recording(dive_result.out)
+        write_recording(tmp_path)
 
 
 @pytest.mark.slow  # the program that reads recordings takes seconds to start
