@@ -78,3 +78,13 @@ def test_perturbation_acts_from_the_left_rotation_first(poses, rng):
     np.testing.assert_allclose(moved, expected, atol=1e-14)
     unmoved = rigid3.perturb(poses[0], np.zeros(6))
     np.testing.assert_allclose(unmoved, poses[0], atol=1e-16)
+
+
+def test_points_by_few_poses_are_those_by_their_own(rng):
+    poses = rigid3.perturb(np.tile(rigid3.IDENTITY, (4, 1)), rng.normal(size=(4, 6)))
+    index, points = rng.integers(0, 4, 50), rng.normal(size=(50, 3))
+    np.testing.assert_allclose(
+        rigid3.transform_indexed(poses, index, points),
+        rigid3.transform(poses[index], points),
+        atol=1e-14,  # a few roundings of numbers near one
+    )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uwsfm._indices import renumbered
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -121,9 +122,10 @@ class Scene:
 
     def points_in_cam(self) -> Array:
         """The observed point in its camera's frame, per observation (N, 3)."""
+        poses = rigid3.compose(self.cam_from_rig[:, None], self.rig_from_world)
+        image = self.camera_idx * self.num_frames + self.frame_idx
         in_world = self.points[self.point_idx]
-        in_rig = rigid3.transform(self.rig_from_world[self.frame_idx], in_world)
-        return rigid3.transform(self.cam_from_rig[self.camera_idx], in_rig)
+        return rigid3.transform_indexed(poses.reshape(-1, 7), image, in_world)
 
     def projections(self) -> tuple[Array, NDArray[np.bool_]]:
         """Exact projections (N, 2) of the points, NaN where not ``valid`` (N,)."""
@@ -164,13 +166,13 @@ class Scene:
             The smaller scene, and the old index of each of its points (P',).
         """
         mask = np.asarray(keep, dtype=bool)
-        used, point_idx = np.unique(self.point_idx[mask], return_inverse=True)
+        used, point_idx = renumbered(self.point_idx[mask], self.num_points)
         smaller = replace(
             self,
             points=self.points[used],
             camera_idx=self.camera_idx[mask],
             frame_idx=self.frame_idx[mask],
-            point_idx=point_idx.astype(np.int64),
+            point_idx=point_idx,
             xy=self.xy[mask],
         )
         return smaller, used

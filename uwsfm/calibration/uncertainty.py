@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._indices import renumbered
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
@@ -270,8 +271,9 @@ def clusters_of(optimum: Optimum) -> IndexArray:
     frame = np.repeat(layout.cell_frame, np.diff(layout.cell_start))
     place = TILES * layout.xy / optimum.image_sizes[layout.camera]
     column, row = np.clip(place.astype(np.int64), 0, TILES - 1).T
-    keys = np.stack([layout.camera, frame, row, column], axis=1)
-    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    size = (len(layout.border_col), len(layout.frame_col), TILES, TILES)
+    keys = np.ravel_multi_index((layout.camera, frame, row, column), size)
+    return renumbered(keys, int(np.prod(size)))[1]
 
 
 def camera_variances(

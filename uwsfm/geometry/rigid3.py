@@ -92,6 +92,17 @@ def transform(b_from_a: ArrayLike, x_in_a: ArrayLike) -> Array:
     return rotate(pose, x_in_a) + pose[..., 4:]
 
 
+def transform_indexed(
+    b_from_a: ArrayLike, index: ArrayLike, x_in_a: ArrayLike
+) -> Array:
+    """Transform points (N, 3), each by one of a few poses (K, 7): ``index`` (N,)."""
+    pose, index = np.asarray(b_from_a, dtype=np.float64), np.asarray(index)
+    rotmat = rotmat_from_quat(pose[:, :4])[index]  # one for each pose, not each point
+    turned = np.einsum("nij,nj->ni", rotmat, np.asarray(x_in_a, float))
+    turned += pose[index, 4:]
+    return turned
+
+
 def compose(c_from_b: ArrayLike, b_from_a: ArrayLike) -> Array:
     """Poses c_from_a (..., 7), with the quaternion renormalised."""
     outer = np.asarray(c_from_b, dtype=np.float64)

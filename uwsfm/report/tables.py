@@ -202,5 +202,6 @@ def frame_stddevs(covariance: Covariance) -> tuple[Array, Array]:
 
 def _distinct(groups: IndexArray, values: IndexArray, count: int) -> NDArray[Any]:
     """How many different values each group has (count,)."""
-    pairs = np.unique(np.stack([groups, values], axis=1), axis=0)
-    return np.bincount(pairs[:, 0], minlength=count)
+    size = int(values.max(initial=0)) + 1
+    pairs = np.unique(groups * size + values)
+    return np.bincount(pairs // size, minlength=count)

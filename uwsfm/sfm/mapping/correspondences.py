@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from uwsfm._indices import renumbered
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
@@ -66,7 +67,7 @@ class Correspondences:
         """(M,) which two images each match joins, numbered from 0."""
         images = self.image[self.matches]
         keys = images[:, 0] * np.int64(len(self.first)) + images[:, 1]
-        return np.unique(keys, return_inverse=True)[1].reshape(-1)
+        return renumbered(keys, (len(self.first) - 1) * len(self.first))[1]
 
     def keypoint_idx(self, keypoints: IndexArray) -> IndexArray:
         """Index of keypoints in their own images."""
@@ -74,19 +75,22 @@ class Correspondences:
 
     @cached_property
     def _by_frame(self) -> tuple[IndexArray, IndexArray]:
-        """Matches sorted by the frames that they touch, and where each frame starts."""
-        frames = self.frame[self.matches]
-        other = np.flatnonzero(frames[:, 0] != frames[:, 1])
-        touched = np.concatenate([frames[:, 0], frames[other, 1]])
-        matches = np.concatenate([np.arange(len(frames)), other])
-        order = np.lexsort((matches, touched))
-        start = np.searchsorted(touched[order], np.arange(self.num_frames + 1))
-        return matches[order].astype(np.int64), start
+        """Ends of matches sorted by their frames, and where each frame starts."""
+        frames = self.frame[self.matches].ravel()
+        order = np.argsort(frames, kind="stable")
+        start = np.zeros(self.num_frames + 1, dtype=np.int64)
+        np.cumsum(np.bincount(frames, minlength=self.num_frames), out=start[1:])
+        return order, start
+
+    def ends_of(self, frame: int) -> IndexArray:
+        """Which ends of matches are in a frame, rising: of match m, 2 m and 2 m + 1."""
+        ends, start = self._by_frame
+        return ends[start[frame] : start[frame + 1]]
 
     def matches_of(self, frame: int) -> IndexArray:
         """Indices of the matches that touch a frame, rising."""
-        matches, start = self._by_frame
-        return matches[start[frame] : start[frame + 1]]
+        matches = self.ends_of(frame) >> 1
+        return matches[np.diff(matches, prepend=-1) != 0]  # both ends may be in it
 
     @cached_property
     def linked_frames(self) -> csr_array:
@@ -114,8 +118,7 @@ class Correspondences:
             rising within each.
         """
         ends = self.matches[matches]  # (m, 2)
-        keypoints, node = np.unique(ends, return_inverse=True)
-        node = node.reshape(ends.shape)
+        keypoints, node = renumbered(ends, len(self.xy))
         graph = coo_array(
             (np.ones(len(node), dtype=np.int8), (node[:, 0], node[:, 1])),
             shape=2 * (len(keypoints),),
@@ -124,7 +127,7 @@ class Correspondences:
         order = np.argsort(track, kind="stable")
         sizes = np.bincount(track)
         start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return start, keypoints[order].astype(np.int64)
+        return start, keypoints[order]
 
 
 def read_correspondences(

@@ -179,8 +179,8 @@ class GrowingMap:
         Pairs of images that the verification did not join have to earn it.
         """
         of = self.correspondences
-        there = self.registered[of.frame[of.matches[matches]]].all(axis=1)
-        matches = matches[there]
+        first, second = self.registered[of.frame[of.matches[matches].T]]
+        matches = matches[first & second]
         good = self.gaps_px(matches) <= max_error_px
         pair = of.pair[matches]
         num_good, num_all, num_verified = (
@@ -264,10 +264,8 @@ class GrowingMap:
         bad = seen[self.errors_px(seen, self.point_of[seen]) > max_error_px]
         self.chains.unlink(bad)
         left = self.chains.of_points(points)
-        _, place, counts = np.unique(
-            self.point_of[left], return_inverse=True, return_counts=True
-        )
-        alone = left[counts[place] < 2]
+        seen_by = self.point_of[left]
+        alone = left[np.bincount(seen_by)[seen_by] < 2]
         self.chains.unlink(alone)
         self._note_change(np.concatenate([bad, alone]))
 
@@ -281,14 +279,14 @@ class GrowingMap:
             verified: By verified matches only, or by any.
         """
         of = self.correspondences
-        rows = [of.matches_of(f) for f in frames.tolist()]
-        matches = np.concatenate([*rows, np.empty(0, dtype=np.int64)])
-        ends = of.matches[matches[of.verified[matches]] if verified else matches]
-        ends = np.concatenate([ends, ends[:, ::-1]])
-        ends = ends[self.point_of[ends[:, 1]] >= 0]
-        # The other end is registered; this one is of the frame that was asked for.
-        ends = ends[~self.registered[of.frame[ends[:, 0]]]]
-        keys = ends[:, 0] * len(self.points) + self.point_of[ends[:, 1]]
+        rows = [of.ends_of(f) for f in frames.tolist()]
+        ends = np.concatenate([*rows, np.empty(0, dtype=np.int64)])
+        if verified:
+            ends = ends[of.verified[ends >> 1]]
+        keypoints = of.matches.reshape(-1)
+        points = self.point_of[keypoints[ends ^ 1]]  # of the other ends
+        seen = points >= 0
+        keys = keypoints[ends[seen]] * len(self.points) + points[seen]
         return np.divmod(np.unique(keys), max(len(self.points), 1))
 
 

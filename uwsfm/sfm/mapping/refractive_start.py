@@ -75,7 +75,8 @@ class RefractiveStart:
         registered = stored["registered"].tolist()
         keypoints = real_keypoints(self.features_path, self.frames, registered)
         camera, frame = stored["camera_idx"], stored["frame_idx"]
-        rows = zip(camera, frame, stored["keypoint_idx"], strict=True)
+        images = [points for of_camera in keypoints for points in of_camera]
+        before = np.cumsum([0, *map(len, images)])[camera * len(registered) + frame]
         return StartArrays(
             frame_names=tuple(self.frames.names[f] for f in registered),
             rig_from_world=stored["rig_from_world"],
@@ -84,7 +85,7 @@ class RefractiveStart:
             frame_idx=frame,
             point_idx=stored["point_idx"],
             keypoint_idx=stored["keypoint_idx"],
-            xy=np.array([keypoints[c][f][k] for c, f, k in rows]),
+            xy=np.concatenate(images)[before + stored["keypoint_idx"]],
             keypoints=keypoints,
         )
 

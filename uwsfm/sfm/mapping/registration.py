@@ -62,9 +62,10 @@ class Ranking:
         score = np.zeros(of.num_frames)
         for cells in GRID_LEVELS:
             column, row = np.clip((place * cells).astype(np.int64), 0, cells - 1).T
-            occupied = np.unique(of.image[keypoints] * cells**2 + row * cells + column)
-            frame = occupied // cells**2 // of.num_cameras
-            score += cells**2 * np.bincount(frame, minlength=of.num_frames)
+            occupied = np.zeros((len(of.first) - 1, cells, cells), dtype=bool)
+            occupied[of.image[keypoints], row, column] = True
+            counts = np.count_nonzero(occupied.reshape(of.num_frames, -1), axis=1)
+            score += cells**2 * counts
         pairs = np.unique(of.frame[keypoints] * len(growing.points) + points)
         counts = np.bincount(
             pairs // max(len(growing.points), 1), minlength=of.num_frames
