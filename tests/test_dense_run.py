@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm.cli import app
-from uwsfm.dense import run
+from uwsfm.dense import maps
 from uwsfm.errors import InputError
 
 
@@ -22,7 +22,7 @@ def dive(tmp_path_factory: pytest.TempPathFactory) -> DenseDive:
 
 def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     made: list[int] = []
-    original = run.stereo_depth
+    original = maps.stereo_depth
 
     def stopped_at(limit: int):
         def counted(*arguments):
@@ -31,7 +31,7 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
             made.append(1)
             return original(*arguments)
 
-        monkeypatch.setattr(run, "stereo_depth", counted)
+        monkeypatch.setattr(maps, "stereo_depth", counted)
 
     stopped_at(2)
     with pytest.raises(KeyboardInterrupt):

@@ -81,7 +81,7 @@ def _table(summary: dict[str, Any]) -> "Table":
     table = Table(title="Dense cloud", title_justify="left", show_header=False)
     maps = summary["depth_maps"]
     shares = [entry["share_matched"] for entry in maps]
-    slabs = sum(entry["num_slabs"] > 1 for entry in maps)
+    slabs = sum((entry["num_slabs"] or 1) > 1 for entry in maps)
     table.add_row("depth maps", f"{len(maps)}")
     table.add_row("pixels with a depth", f"{100 * sum(shares) / len(shares):.0f} %")
     table.add_row("depth range split", f"in {slabs} of them")

@@ -96,10 +96,14 @@ def noise_px(view: Placed, others: list[Placed]) -> Array:
 
 
 def robust_stddev(values: Array) -> float | None:
-    """Of a sample around zero, from its median; None if it is too small to tell."""
+    """Of a sample around zero, from its 90th percentile; None if it is too small.
+
+    Matching errors have long tails: the median alone would promise too much.
+    """
     if len(values) < _MIN_SAMPLES:
         return None
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    spread = np.abs(values - np.median(values))
+    return float(np.percentile(spread, 90.0) / 1.645)
 
 
 def fuse(

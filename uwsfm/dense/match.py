@@ -148,7 +148,7 @@ def _refined(
     valid = np.isfinite(start)
     mask = valid.astype(np.float32)
     disparity = smoothed(start, valid, window)
-    mean, contrast = _contrast(left, mask, window)
+    mean, contrast = contrast_of(left, mask, window)
     target = (left - mean) / contrast
     # cv2.Sobel's weights sum to eight pixels.
     gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
@@ -156,14 +156,14 @@ def _refined(
     count = 4.0 * np.pi * window**2
     for _ in range(NUM_STEPS):
         shown, slope = _warped((right, gradient), disparity, rows)
-        mean, contrast = _contrast(shown, mask, window)
+        mean, contrast = contrast_of(shown, mask, window)
         slope *= mask / contrast
         error = target - (shown - mean) / contrast
-        information = np.maximum(_blur(slope * slope, window), 1e-6)
-        step = _blur(slope * error, window) / information
+        information = np.maximum(blurred(slope * slope, window), 1e-6)
+        step = blurred(slope * error, window) / information
         step = np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)
         disparity = smoothed(np.where(valid, disparity - step, np.nan), valid, window)
-    variance = _blur(error * error * mask, window) / (count * information)
+    variance = blurred(error * error * mask, window) / (count * information)
     (shown,) = _warped((right,), disparity, rows)
     return _Refined(disparity, variance, _correlation(left, shown, mask, window))
 
@@ -183,23 +183,23 @@ def _warped(planes: tuple[Plane, ...], disparity: Plane, rows: Plane) -> list[Pl
 
 def _correlation(first: Plane, second: Plane, mask: Plane, window: float) -> Plane:
     """Of two planes in windows."""
-    share = np.maximum(_blur(mask, window), 1e-3)
+    share = np.maximum(blurred(mask, window), 1e-3)
     means, contrasts = zip(
-        *(_contrast(plane, mask, window) for plane in (first, second)), strict=True
+        *(contrast_of(plane, mask, window) for plane in (first, second)), strict=True
     )
-    product = _blur(first * second * mask, window) / share - means[0] * means[1]
+    product = blurred(first * second * mask, window) / share - means[0] * means[1]
     return product / (contrasts[0] * contrasts[1])
 
 
-def _contrast(plane: Plane, mask: Plane, window: float) -> tuple[Plane, Plane]:
+def contrast_of(plane: Plane, mask: Plane, window: float) -> tuple[Plane, Plane]:
     """Mean and standard deviation in windows, the latter at least `MIN_CONTRAST`."""
-    share = np.maximum(_blur(mask, window), 1e-3)
-    mean = _blur(plane * mask, window) / share
-    square = _blur(plane * plane * mask, window) / share
+    share = np.maximum(blurred(mask, window), 1e-3)
+    mean = blurred(plane * mask, window) / share
+    square = blurred(plane * plane * mask, window) / share
     return mean, np.sqrt(np.maximum(square - mean * mean, MIN_CONTRAST**2))
 
 
-def _blur(plane: Plane, window: float) -> Plane:
+def blurred(plane: Plane, window: float) -> Plane:
     return cv2.GaussianBlur(plane, (0, 0), window, borderType=cv2.BORDER_REFLECT)
 
 

@@ -17,29 +17,17 @@ import numpy as np
 
 from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
-from uwsfm.dense.calibration_error import CalibrationError
-from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
-from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, placed, robust_stddev
-from uwsfm.dense.match import COST_BYTES, MULTIPLE
+from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
+from uwsfm.dense.maps import DepthMaps
 from uwsfm.dense.options import ASSUMED_NOISE_PX, DenseOptions
-from uwsfm.dense.stereo import BYTES_PER_PIXEL, stereo_depth
-from uwsfm.dense.views import (
-    View,
-    cam_from_world,
-    load_image,
-    neighbours,
-    slabs_of,
-    stereo_views,
-)
+from uwsfm.dense.views import load_image, neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.export.files import WORK
 from uwsfm.export.summary import write_json
-from uwsfm.result_folder import Result, open_result
-from uwsfm.sfm.steps import fingerprint
+from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
-FOLDER, CLOUD, SUMMARY = "dense", "cloud.ply", "summary.json"
-FORMAT = 2
+SUMMARY = "summary.json"
+"""Beside the cloud."""
 PLACED_BYTES = 28
 """Per pixel of a depth map in memory, with its points."""
 _NOISE_VIEWS, _NOISE_NEIGHBOURS = 24, 3
@@ -100,13 +88,12 @@ class _Run:
     ) -> None:
         self.result, self.images, self.options = result, images, options
         self.model, self.progress = result.model, progress
-        self.views, self.refused = stereo_views(self.model)
-        self.work = result.folder / WORK / FOLDER
+        self.maps = DepthMaps(result, images)
+        self.views = self.maps.views
         cores = os.cpu_count() or 1
         self.threads = cores if options.num_threads < 1 else options.num_threads
-        self.errors: dict[tuple[int, int], CalibrationError | None] = {}
         self.seconds: dict[str, float] = {}
-        self.store = _Store(self._placed, self._depth_budget())
+        self.store = _Store(self.maps.placed, self._depth_budget())
 
     def __enter__(self) -> _Run:
         # OpenCV's own threads would fight with ours.
@@ -127,11 +114,11 @@ class _Run:
                 f"no point is confirmed by {self.options.min_views} depth maps: the "
                 f"{len(self.views)} frames overlap too little; try --min-views 1"
             )
-        folder = self.result.folder / FOLDER
+        path = self.result.folder / DENSE_CLOUD
         unit = self.result.unit
-        write_cloud(cloud, folder / CLOUD, unit)
+        write_cloud(cloud, path, unit)
         summary = {
-            "cloud": CLOUD,
+            "cloud": path.name,
             "model": self.result.fingerprint,
             "num_points": len(cloud),
             "unit": unit,
@@ -144,14 +131,14 @@ class _Run:
             "num_views_mean": float(np.mean(cloud.num_views)),
             "depth_maps": matched,
             "pairs_left_out": {
-                f"{a}-{b}": reason for (a, b), reason in self.refused.items()
+                f"{a}-{b}": reason for (a, b), reason in self.maps.refused.items()
             },
             **counts,
             "options": asdict(self.options),
             "seconds": self.seconds,
         }
-        write_json(summary, folder / SUMMARY)
-        return DenseResult(cloud=cloud, summary=summary, path=folder / CLOUD)
+        write_json(summary, path.with_name(SUMMARY))
+        return DenseResult(cloud=cloud, summary=summary, path=path)
 
     def _timed(self, step: str, action: Callable[[], Any]) -> Any:
         start = time.monotonic()
@@ -177,7 +164,7 @@ class _Run:
         self.progress("depth maps", 0, len(self.views))
         with ThreadPoolExecutor(workers) as pool:
             jobs = {
-                pool.submit(self._depth, index, budget): index
+                pool.submit(self.maps.make, index, budget): index
                 for index in range(len(self.views))
             }
             try:
@@ -189,57 +176,6 @@ class _Run:
                 raise
         return entries
 
-    def _depth(self, index: int, budget: float) -> dict[str, Any]:
-        view = self.views[index]
-        slabs = slabs_of(self.model, view)
-        path, key = self._path(view), self._key(view)
-        depth = read_depth_map(path, key)
-        if depth is None:
-            left, right = (
-                cv2.cvtColor(
-                    load_image(self.model, self.images, camera, name),
-                    cv2.COLOR_BGR2GRAY,
-                )
-                for camera, name in (
-                    (view.camera, view.name),
-                    (view.partner, view.partner_name),
-                )
-            )
-            depth = stereo_depth(slabs, left, right, budget).depth
-            write_depth_map(depth, path, key)
-        return {
-            "image": view.name,
-            "partner": view.partner_name,
-            "near": view.near,
-            "far": view.far,
-            "num_slabs": len(slabs),
-            "deviation_px": max(slab.deviation_px for slab in slabs),
-            "share_matched": depth.num_valid / depth.ranges.size,
-        }
-
-    def _path(self, view: View) -> Path:
-        name = f"{view.frame:06d}_{view.camera}-{view.partner}.npz"
-        return self.work / name
-
-    def _key(self, view: View) -> str:
-        """Of all that a depth map depends on."""
-        scene = self.model.scene
-        cameras = [
-            (scene.cameras[c].lens.tolist(), scene.cameras[c].port.row.tolist())
-            for c in view.key
-        ]
-        files = []
-        for name in (view.name, view.partner_name):
-            path = self.images / name
-            if not path.is_file():
-                raise InputError(
-                    f"image {path} is missing: say with --images where it is"
-                )
-            status = path.stat()
-            files.append((name, status.st_size, status.st_mtime_ns))
-        poses = scene.cam_from_rig[list(view.key)].tolist()
-        return fingerprint([FORMAT, cameras, files, poses, view.near, view.far])
-
     # Memory.
 
     def _depth_budget(self) -> float:
@@ -248,18 +184,11 @@ class _Run:
 
         return self.options.max_memory - psutil.Process().memory_info().rss
 
-    def _rectified_pixels(self) -> int:
-        return max(
-            slab.size[0] * slab.size[1]
-            for view in self.views
-            for slab in slabs_of(self.model, view)
-        )
-
     def _needed(self) -> float:
-        """Bytes of one depth map with the smallest tiles."""
-        tile = (16 * MULTIPLE) ** 2 * COST_BYTES * 512
+        """Bytes of the process while one depth map is made, at least."""
         used = self.options.max_memory - self._depth_budget()
-        return used + BYTES_PER_PIXEL * self._rectified_pixels() + tile
+        largest = {v.key: i for i, v in enumerate(self.views)}
+        return used + max(self.maps.bytes_of(index) for index in largest.values())
 
     def _budget_of(self, workers: int) -> float | None:
         """Bytes for each worker; None if they are too few."""
@@ -269,59 +198,15 @@ class _Run:
 
     # Fusion.
 
-    def _placed(self, index: int) -> Placed:
-        view = self.views[index]
-        depth = read_depth_map(self._path(view), self._key(view))
-        if depth is None:
-            raise UwsfmError(f"{self._path(view)} has changed while it was in use")
-        camera = self.model.scene.cameras[view.camera]
-        return placed(
-            camera,
-            cam_from_world(self.model, view),
-            depth.ranges,
-            depth.sensitivity,
-            self._calibration(view, depth),
-        )
-
-    def _calibration(self, view: View, depth: DepthMap) -> Any:
-        height, width = depth.ranges.shape
-        found = np.zeros((height, width), dtype=np.float32)
-        error = self.errors.get(view.key)
-        if error is None:
-            return found
-        rows = max(1, 200_000 // width)
-        camera = self.model.scene.cameras[view.camera]
-        for top in range(0, height, rows):
-            bottom = min(top + rows, height)
-            values = error.stddev(
-                pixel_rows(camera, top, bottom), depth.ranges[top:bottom].ravel()
-            )
-            found[top:bottom] = values.reshape(bottom - top, width)
-        return np.nan_to_num(found)
-
-    def _prepare_errors(self) -> None:
-        covariance = self.result.calibration.covariance
-        for key in {view.key for view in self.views}:
-            of_key = [view for view in self.views if view.key == key]
-            self.errors[key] = None
-            if covariance.determined and len(covariance.border):
-                self.errors[key] = CalibrationError(
-                    self.model.scene,
-                    covariance,
-                    key,
-                    0.8 * min(view.near for view in of_key),
-                    1.5 * max(view.far for view in of_key),
-                )
-
     def _calibration_summary(self) -> dict[str, float | None]:
         return {
             f"{a}-{b}": None if error is None else error.largest
-            for (a, b), error in self.errors.items()
+            for (a, b), error in self.maps.errors.items()
         }
 
     def _noise(self) -> tuple[float, bool]:
         """Standard deviation of a disparity, and whether it is only assumed."""
-        self._prepare_errors()
+        self.maps.prepare_errors()
         self.near = neighbours(self.model, self.views, self.options.max_neighbours)
         if self.options.noise_px is not None:
             return self.options.noise_px, True

@@ -13,10 +13,15 @@ from uwsfm.dense.rectify import Pair, Rectification, rectifications
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import Scene
 from uwsfm.sfm.images import read_color, size_fault
 
 MIN_POINTS = 10
 """Of a frame, to know its depths from; with fewer those of all frames serve."""
+NUM_SOURCES = 4
+"""Neighbouring frames that one camera's image is swept with."""
+MIN_PARALLAX, GOOD_PARALLAX = 0.03, 0.12
+"""Distance between frames over that of the scene."""
 DEPTH_PERCENTILES = (1.0, 99.0)
 DEPTH_MARGIN = 0.15
 """Of the inverse depths, on both sides: the scene goes on between its points."""
@@ -28,19 +33,25 @@ class View:
 
     camera: int
     """The left one, whose pixels have depths."""
-    partner: int
     frame: int
     name: str
     """Path of the image below the image folder."""
-    partner_name: str
+    others: tuple[tuple[int, int], ...]
+    """Camera and frame of the images it is compared with: that of the other camera of a
+    pair, or neighbouring frames of the same camera."""
+    other_names: tuple[str, ...]
     near: float
     """Depths along the axis of the camera, metres."""
     far: float
 
     @property
     def key(self) -> tuple[int, int]:
-        """Camera and partner."""
-        return self.camera, self.partner
+        """Its camera and that of the others."""
+        return self.camera, self.others[0][0]
+
+    @property
+    def is_stereo(self) -> bool:
+        return self.others[0][1] == self.frame
 
 
 def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
@@ -75,10 +86,10 @@ def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
                     views.append(
                         View(
                             camera=left,
-                            partner=right,
                             frame=frame,
                             name=model.image_name(left, frame),
-                            partner_name=model.image_name(right, frame),
+                            others=((right, frame),),
+                            other_names=(model.image_name(right, frame),),
                             near=near,
                             far=far,
                         )
@@ -93,6 +104,55 @@ def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
             + (reasons or "no frame has images of two cameras")
         )
     return views, refused
+
+
+def sweep_views(model: Model) -> list[View]:
+    """Depth maps of one camera's images from its neighbouring frames.
+
+    Raises:
+        InputError: no frame has two neighbours that see the same from elsewhere.
+    """
+    scene = model.scene
+    shared = _shared_points(scene)
+    world_from_rig = rigid3.inverse(scene.rig_from_world)
+    depths = scene.points_in_cam()[:, 2]
+    views = []
+    for camera in range(len(scene.cameras)):
+        for frame in range(scene.num_frames):
+            if not model.has_image(camera, frame):
+                continue
+            rows = (scene.camera_idx == camera) & (scene.frame_idx == frame)
+            own = depths[rows & np.isfinite(depths)]
+            if len(own) < MIN_POINTS:
+                continue
+            moved = world_from_rig[:, 4:] - world_from_rig[frame, 4:]
+            angle = np.linalg.norm(moved, axis=1) / np.median(own)
+            counts = shared[[frame]].toarray()[0]
+            # More points and, up to a limit, more parallax; never a turn on the spot.
+            worth = counts * np.minimum(angle / GOOD_PARALLAX, 1.0)
+            worth[(angle < MIN_PARALLAX) | (counts < MIN_POINTS)] = 0.0
+            best = [int(f) for f in np.argsort(-worth, kind="stable") if worth[f] > 0.0]
+            chosen = [f for f in best if model.has_image(camera, f)][:NUM_SOURCES]
+            if len(chosen) < 2:
+                continue
+            near, far = _limits(own)
+            views.append(
+                View(
+                    camera=camera,
+                    frame=frame,
+                    name=model.image_name(camera, frame),
+                    others=tuple((camera, f) for f in chosen),
+                    other_names=tuple(model.image_name(camera, f) for f in chosen),
+                    near=near,
+                    far=far,
+                )
+            )
+    if not views:
+        raise InputError(
+            "no frame can be compared: depth from one camera takes at least two "
+            "neighbouring frames that see the same points from elsewhere"
+        )
+    return views
 
 
 def pair_of(model: Model, left: int, right: int, near: float, far: float) -> Pair:
@@ -115,25 +175,19 @@ def slabs_of(model: Model, view: View) -> tuple[Rectification, ...]:
     Raises:
         InputError: the cameras share too little view at the depths of this frame.
     """
-    return rectifications(
-        pair_of(model, view.camera, view.partner, view.near, view.far)
-    )
+    return rectifications(pair_of(model, *view.key, view.near, view.far))
 
 
-def cam_from_world(model: Model, view: View) -> Array:
-    """Pose (7,) of a view."""
+def cam_from_world(model: Model, camera: int, frame: int) -> Array:
+    """Pose (7,) of an image."""
     return rigid3.compose(
-        model.scene.cam_from_rig[view.camera], model.scene.rig_from_world[view.frame]
+        model.scene.cam_from_rig[camera], model.scene.rig_from_world[frame]
     )
 
 
 def neighbours(model: Model, views: list[View], limit: int) -> list[list[int]]:
     """For each view the indices of those that share most points with it."""
-    scene = model.scene
-    shape = scene.num_frames, scene.num_points
-    pairs = np.unique(np.stack([scene.frame_idx, scene.point_idx], axis=1), axis=0)
-    seen = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape).tocsr()
-    shared = (seen @ seen.T).tocsr()
+    shared = _shared_points(model.scene)
     of_frame: dict[int, list[int]] = {}
     for index, view in enumerate(views):
         of_frame.setdefault(view.frame, []).append(index)
@@ -146,6 +200,14 @@ def neighbours(model: Model, views: list[View], limit: int) -> list[list[int]]:
         near = [i for f in frames for i in of_frame.get(f, []) if i != index]
         found.append(near[:limit])
     return found
+
+
+def _shared_points(scene: Scene):
+    """How many points two frames share, (F, F) sparse."""
+    shape = scene.num_frames, scene.num_points
+    pairs = np.unique(np.stack([scene.frame_idx, scene.point_idx], axis=1), axis=0)
+    seen = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape).tocsr()
+    return (seen @ seen.T).tocsr()
 
 
 def load_image(model: Model, folder: Path, camera: int, name: str):
