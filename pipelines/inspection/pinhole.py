@@ -26,7 +26,7 @@ def best_pinholes(scene: Scene) -> tuple[Scene, float]:
     """The scene with pinholes, adjusted, and its RMS in pixels."""
     cameras = []
     for camera in scene.cameras:
-        lens = np.array(camera.camera.params)
+        lens = camera.lens[:8].copy()  # fx, fy, cx, cy, k1, k2, p1, p2
         lens[:2] *= camera.port.n_water
         pinhole = pycolmap.Camera(
             model="OPENCV", width=camera.width, height=camera.height, params=lens
