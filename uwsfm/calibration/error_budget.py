@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from uwsfm._indices import distinct
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
@@ -133,7 +134,7 @@ def _propagate(
     state = outside.placed(scene)
     sigma = _sigma(scene, layout.num_frame_cols + num_free)
     own = border_priors(scene, settings, columns, sigma)
-    used, frames = np.unique(scene.point_idx), np.unique(scene.frame_idx)
+    used, frames = distinct(scene.point_idx), distinct(scene.frame_idx)
     priors = with_terms(own, outside.terms(used, frames, sigma), state)
     reduction, offset = analyse(layout), layout.num_frame_cols
     with suitable_blas(reduction):

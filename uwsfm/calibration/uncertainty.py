@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._indices import renumbered
+from uwsfm._indices import distinct, renumbered
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
@@ -181,7 +181,7 @@ def predict_covariance(
         navigation=outside.navigation,
         num_lengths=outside.num_lengths,
     )
-    used, frames = np.unique(scene.point_idx), np.unique(scene.frame_idx)
+    used, frames = distinct(scene.point_idx), distinct(scene.frame_idx)
     own = border_priors(scene, settings, columns, noise_px)
     priors = with_terms(own, outside.terms(used, frames, noise_px), state)
     eqs = likelihood(layout, state, priors)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._indices import distinct
 from uwsfm.calibration.problem import Covariance
 from uwsfm.colmap import Model
 from uwsfm.geometry import rigid3
@@ -203,5 +204,5 @@ def frame_stddevs(covariance: Covariance) -> tuple[Array, Array]:
 def _distinct(groups: IndexArray, values: IndexArray, count: int) -> NDArray[Any]:
     """How many different values each group has (count,)."""
     size = int(values.max(initial=0)) + 1
-    pairs = np.unique(groups * size + values)
+    pairs = distinct(groups * size + values)
     return np.bincount(pairs // size, minlength=count)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwsfm._indices import renumbered
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort
@@ -89,7 +90,7 @@ def adjust_locally(growing: GrowingMap, free: IndexArray) -> IndexArray:
     held."""
     points = growing.points_of(free)
     scene = growing.scene_of(growing.chains.of_points(points))
-    frames, frame_idx = np.unique(scene.frame_idx, return_inverse=True)
+    frames, frame_idx = renumbered(scene.frame_idx, scene.num_frames)
     part = replace(
         scene,
         points=growing.points[points],

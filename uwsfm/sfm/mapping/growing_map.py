@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._indices import distinct
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
@@ -155,7 +156,7 @@ class GrowingMap:
         """The points that some frames see, rising."""
         of = self.correspondences
         seen = np.concatenate([self.point_of[of.keypoints_of(f)] for f in frames])
-        return np.unique(seen[seen >= 0])
+        return distinct(seen[seen >= 0])
 
     def counts(self) -> dict[str, float]:
         """For the report."""
@@ -235,8 +236,8 @@ class GrowingMap:
     def _note_change(self, keypoints: IndexArray) -> None:
         """What frames that match these keypoints could see is not known any more."""
         of = self.correspondences
-        frames = np.unique(of.frame[keypoints])
-        self.changes[np.unique(of.linked_frames[frames].indices)] += 1
+        frames = distinct(of.frame[keypoints])
+        self.changes[distinct(of.linked_frames[frames].indices)] += 1
 
     def errors_px(self, keypoints: IndexArray, points: IndexArray) -> Array:
         """True pixel errors (n,) of keypoints at points; inf if not visible."""
@@ -287,7 +288,7 @@ class GrowingMap:
         points = self.point_of[keypoints[ends ^ 1]]  # of the other ends
         seen = points >= 0
         keys = keypoints[ends[seen]] * len(self.points) + points[seen]
-        return np.divmod(np.unique(keys), max(len(self.points), 1))
+        return np.divmod(distinct(keys), max(len(self.points), 1))
 
 
 def _firsts(keys: IndexArray) -> IndexArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from uwsfm._indices import distinct
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.absolute_pose import AbsolutePoseOptions, estimate_rig_pose
@@ -66,7 +67,7 @@ class Ranking:
             occupied[of.image[keypoints], row, column] = True
             counts = np.count_nonzero(occupied.reshape(of.num_frames, -1), axis=1)
             score += cells**2 * counts
-        pairs = np.unique(of.frame[keypoints] * len(growing.points) + points)
+        pairs = distinct(of.frame[keypoints] * len(growing.points) + points)
         counts = np.bincount(
             pairs // max(len(growing.points), 1), minlength=of.num_frames
         )
