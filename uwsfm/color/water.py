@@ -156,6 +156,8 @@ def _minimum(
     """Damped Gauss-Newton steps of four numbers in a box, with new weights each, or a
     few steps with the weights that are."""
     found, damping = start, 1e-3
+    if reweight:
+        problem.reweight(found)
     for _ in range(_MAX_STEPS if reweight else _NUM_FIRST_STEPS):
         cost = problem.cost(found)
         jacobian, residuals = problem.jacobian(found), problem.residuals(found)
