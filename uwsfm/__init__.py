@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.uncertainty import predict_covariance
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
+    from uwsfm.color.commands import correct_colors
     from uwsfm.dense.run import dense_cloud
     from uwsfm.errors import InputError, UwsfmError
     from uwsfm.export.files import export_colmap, export_ply, read_model
@@ -42,6 +43,12 @@ if TYPE_CHECKING:
     from uwsfm.sfm.refractive_colmap import (
         read_refractive_colmap,
         rig_of_refractive_colmap,
+    )
+    from uwsfm.surface.commands import (
+        clean_cloud,
+        export_las,
+        make_map,
+        mesh_cloud,
     )
 
 refuse_broken_zlib()
@@ -69,6 +76,8 @@ _HOMES = {
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
     "calibrate_housing": "uwsfm.housing_pipeline",
+    "clean_cloud": "uwsfm.surface.commands",
+    "correct_colors": "uwsfm.color.commands",
     "error_budget": "uwsfm.calibration.error_budget",
     "perspective_adjustment": "uwsfm.calibration.perspective",
     "predict_covariance": "uwsfm.calibration.uncertainty",
@@ -76,11 +85,14 @@ _HOMES = {
     "dense_cloud": "uwsfm.dense.run",
     "export_colmap": "uwsfm.export.files",
     "export_housing": "uwsfm.export.housing",
+    "export_las": "uwsfm.surface.commands",
     "export_pinhole": "uwsfm.export.pinhole_files",
     "export_ply": "uwsfm.export.files",
     "export_refractive_colmap": "uwsfm.export.refractive_colmap",
     "export_scene_ply": "uwsfm.export.scene_ply",
     "load_rig": "uwsfm.rig_file",
+    "make_map": "uwsfm.surface.commands",
+    "mesh_cloud": "uwsfm.surface.commands",
     "measure": "uwsfm.measuring.measure",
     "read_cloud": "uwsfm.cloud",
     "read_model": "uwsfm.export.files",
@@ -115,16 +127,21 @@ __all__ = [
     "UwsfmError",
     "calibrate",
     "calibrate_housing",
+    "clean_cloud",
+    "correct_colors",
     "dense_cloud",
     "error_budget",
     "export_colmap",
     "export_housing",
+    "export_las",
     "export_pinhole",
     "export_ply",
     "export_refractive_colmap",
     "export_scene_ply",
     "load_rig",
+    "make_map",
     "measure",
+    "mesh_cloud",
     "open_result",
     "perspective_adjustment",
     "predict_covariance",
@@ -136,8 +153,8 @@ __all__ = [
     "rig_of_refractive_colmap",
     "run_batch",
     "verdicts",
-    "write_report",
     "write_cloud",
+    "write_report",
 ]
 
 
