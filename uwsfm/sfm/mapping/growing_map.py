@@ -86,10 +86,9 @@ class GrowingMap:
             self._lenses = np.array([camera.lens for camera in self.cameras])
             self._ports = np.array([camera.port.row for camera in self.cameras])
             for c, camera in enumerate(self.cameras):
-                rows = self.correspondences.camera == c
-                self._camera_rays[:, rows] = camera.ray_from_img(
-                    self.correspondences.xy[rows]
-                )
+                rows = np.flatnonzero(self.correspondences.camera == c)
+                rays = camera.ray_from_img(self.correspondences.xy[rows])
+                self._camera_rays[0, rows], self._camera_rays[1, rows] = rays
         self.place(np.flatnonzero(self.registered), self.rig_from_world)
 
     def place(self, frames: IndexArray, rig_from_world: Array) -> None:
