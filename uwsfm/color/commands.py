@@ -43,8 +43,8 @@ def correct_colors(
 ) -> dict[str, Any]:
     """Estimate what the water does to colours, and take it from points and images.
 
-    Writes ``water.json``, always; and if the water is determined, ``points.ply``,
-    ``cloud.ply`` if there is a dense cloud, and the images if they are wanted.
+    Writes water.json, always; and if the water is determined, points.ply, cloud.ply if
+    there is a dense cloud, and the images if they are wanted.
 
     Args:
         out: result folder.
@@ -60,14 +60,13 @@ def correct_colors(
 
     Raises:
         InputError: nothing to read, or something to write over.
-        UwsfmError: the water is not determined (water.json is there nevertheless), or
-            too few points were seen twice.
+        UwsfmError: the water is not determined, or too few points were seen twice.
     """
     target = checked_target(folder)
     if encoding not in ENCODINGS:
         raise InputError(f"--encoding {encoding}: is one of {', '.join(ENCODINGS)}")
-    result = open_result(out, images)
-    reader = _Reader(result, progress)
+    reader = _Reader(open_result(out, images), progress)
+    result = reader.result
     samples = sample_scene(result.model.scene, reader.read, encoding)
     water = fit_water(samples)
     problem = water.problem()
@@ -75,6 +74,7 @@ def correct_colors(
         "source": str(out),
         "unit": result.unit,
         "encoding": encoding,
+        "num_lost_samples": samples.num_lost,
         **water.summary(),
         "problem": problem,
         "warnings": water.warnings() + exposure_warnings(reader.paths()),
@@ -82,14 +82,9 @@ def correct_colors(
     with replaced_dir(target) as partial:
         if problem is None:
             correction = make_correction(water, samples, encoding, gray=gray)
-            report["gains"] = correction.gains.tolist()
             report["white_balance"] = "gray" if gray else "none"
-            _write_points(result, correction, samples, partial)
-            report["num_without_range"] = _write_cloud(result, correction, partial)
-            if write_images:
-                report["share_between_points"] = _write_images(
-                    reader, correction, samples, partial / "images"
-                )
+            wanted = reader if write_images else None
+            report |= _write_all(result, correction, samples, partial, wanted)
         write_json(report, partial / WATER)
     if problem is not None:
         raise UwsfmError(f"{problem} (the estimates are in {target / WATER})")
@@ -125,6 +120,25 @@ class _Reader:
         self._done[step] = self._done.get(step, 0) + 1
         self.progress(step, self._done[step], len(self.places))
         return np.ascontiguousarray(image[..., 2::-1])
+
+
+def _write_all(
+    result: Result,
+    correction: Correction,
+    samples: Samples,
+    folder: Path,
+    reader: _Reader | None,
+) -> dict[str, Any]:
+    """Points, cloud and images without water; entries of the report."""
+    _write_points(result, correction, samples, folder)
+    entries: dict[str, Any] = {
+        "gains": correction.gains.tolist(),
+        "num_without_range": _write_cloud(result, correction, folder),
+    }
+    if reader is not None:
+        share = _write_images(reader, correction, samples, folder / "images")
+        entries["share_between_points"] = share
+    return entries
 
 
 def _write_points(

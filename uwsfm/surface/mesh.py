@@ -23,7 +23,6 @@ _BALLS = (1.0, 2.0, 4.0)
 _NORMAL_NEIGHBOURS = 24
 _COLOR_NEIGHBOURS = 4
 _DENSITY_QUANTILE = 0.01
-# Poisson's octree also has cells larger than the spacing.
 _MIN_POINTS = 10
 
 
