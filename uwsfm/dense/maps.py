@@ -33,7 +33,7 @@ FOLDER = "dense"
 """In the workspace."""
 SMALLEST_TILE = (16 * MULTIPLE) ** 2 * COST_BYTES * 512
 """Bytes of the matcher."""
-FORMAT = 2
+FORMAT = 3
 """Of the depth maps, what makes them included: others are made again."""
 
 

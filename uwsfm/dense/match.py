@@ -124,14 +124,14 @@ def refine(left: Gray, right: Gray, start: Plane, rows: Plane) -> tuple[Plane, P
     correlation = np.full_like(start, -1.0)
     for window, blur_px in zip(WINDOWS_PX, SMEARED_PX, strict=True):
         found = _refined(*pair, start, rows, window)
-        # What went astray, at a step in depth say, has no weight.
+        # What went astray, in a plain area say, has no weight.
         share = 1.0 / (found.variance + blur_px**2)
         share[~(np.abs(found.disparity - start) < MAX_CHANGE_PX)] = 0.0
         weight += share
         total += share * np.nan_to_num(found.disparity)
         np.maximum(correlation, found.correlation, out=correlation)
     with np.errstate(invalid="ignore", divide="ignore"):
-        disparity = np.where(weight > 0.0, total / weight, start)
+        disparity = np.where(weight > 0.0, total / weight, np.nan)
     disparity[correlation < MIN_CORRELATION] = np.nan
     return disparity, correlation
 
