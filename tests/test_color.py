@@ -75,7 +75,7 @@ def rendered(open3d) -> tuple[Scene, list[np.ndarray], np.ndarray]:
     camera = uwsfm.RefractiveCamera(lens, uwsfm.FlatPort(distance=0.05, thickness=0.01))
 
     def image(index: int, water: WaterOptions | None) -> np.ndarray:
-        sensor = SensorOptions(samples_per_side=2, noise=1.0)
+        sensor = SensorOptions(samples_per_side=1, noise=1.0)
         rng = np.random.default_rng(index)
         return render_image(
             camera, poses[index], floor, water=water, sensor=sensor, rng=rng
@@ -120,9 +120,9 @@ def test_rendered_water_comes_back_within_15_percent(rendered):
 
 def tracks(rng: np.random.Generator, low: float, high: float, fall=None) -> Samples:
     """Points seen at several ranges by the equation itself, with 1 % of noise."""
-    point = np.repeat(np.arange(600), 6)
+    point = np.repeat(np.arange(250), 6)
     ranges = rng.uniform(low, high, len(point))
-    albedo = rng.uniform(0.02, 0.6, (600, 3))[point]
+    albedo = rng.uniform(0.02, 0.6, (250, 3))[point]
     fade = np.exp(-ranges[:, None] * WATER.attenuation_per_m)
     veil = 1.0 - np.exp(-ranges[:, None] * WATER.backscatter_per_m)
     light = albedo * fade
@@ -133,7 +133,7 @@ def tracks(rng: np.random.Generator, low: float, high: float, fall=None) -> Samp
         light=light,
         range=ranges,
         point_idx=point,
-        image_idx=np.tile(np.arange(6), 600),
+        image_idx=np.tile(np.arange(6), 250),
         wide_light=light,
         pixel_light=light,
         num_lost=0,
@@ -153,8 +153,8 @@ def test_the_equation_s_own_numbers_come_back_within_their_deviations(rng):
         ]
         values = [found.attenuation, found.veil_slope, found.backscatter]
         assert (np.abs(np.subtract(values, truth)) < 4.0 * found.stddevs).all()
-        # And these say something: 1 % of noise on 3600 samples.
-        assert found.stddevs[0] < 0.02
+        # And these say something: 1 % of noise on 1500 samples.
+        assert found.stddevs[0] < 0.03
 
 
 def test_what_the_images_do_not_determine_is_not_corrected(rng):
