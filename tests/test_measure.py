@@ -19,6 +19,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.measuring.measure import agreement
 from uwsfm.measuring.surface import Surface, SurfaceImage
 from uwsfm.measuring.table import measurement_table, rounded
+from uwsfm.surface.source import find_source
 
 CLICK_PX = 0.5
 
@@ -146,6 +147,8 @@ def test_a_cloud_of_an_earlier_model_is_refused(dense):
     summary.write_text(json.dumps({"model": "another"}))
     with pytest.raises(InputError, match="is of an earlier model: run uwsfm dense"):
         uwsfm.measure(opened, content)
+    with pytest.raises(InputError, match="is of an earlier model: run uwsfm dense"):
+        find_source(opened.folder)  # of maps, meshes, cleaned and exported clouds
     summary.unlink()
 
 

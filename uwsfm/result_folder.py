@@ -95,6 +95,25 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
     )
 
 
+def find_dense_cloud(folder: Path) -> Path | None:
+    """The dense cloud of a result folder; None if there is none.
+
+    Raises:
+        InputError: its summary names another model than the folder's.
+    """
+    cloud = folder / DENSE_CLOUD
+    if not cloud.is_file():
+        return None
+    try:
+        summary = json.loads((cloud.parent / SUMMARY).read_text(encoding="utf-8"))
+        mark = summary["model"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return cloud  # it names no model, so that it was put there by hand
+    if mark != fingerprint(folder / SPARSE, folder / HOUSING):
+        raise InputError(f"{cloud} is of an earlier model: run uwsfm dense again")
+    return cloud
+
+
 def store_calibration(calibration: CalibrationResult, out: Path) -> None:
     """Write calibration.npz beside the model and the housing that are there."""
     mark = fingerprint(out / SPARSE, out / HOUSING)

@@ -25,7 +25,7 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import POINTS, checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.export.warp import read_image, write_image
-from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
+from uwsfm.result_folder import Result, find_dense_cloud, open_result
 
 WATER = "water.json"
 STATED = "colours without the water, by uwsfm color"
@@ -156,8 +156,8 @@ def _write_points(
 
 def _write_cloud(result: Result, correction: Correction, folder: Path) -> int | None:
     """Number of points without a range, which keep their colour; None: no cloud."""
-    path = result.folder / DENSE_CLOUD
-    if not path.is_file():
+    path = find_dense_cloud(result.folder)
+    if path is None:
         return None
     table, _ = read_vertices(path)
     colors = np.stack([table[name] for name in ("red", "green", "blue")], axis=1)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from uwsfm.cloud import read_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import SUMMARY
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import DENSE_CLOUD, Result
+from uwsfm.result_folder import DENSE_CLOUD, Result, find_dense_cloud
 from uwsfm.scene import IndexArray, Scene
 
 NEIGHBOURS = 12
@@ -91,25 +88,13 @@ def surface_of(result: Result) -> Surface:
     Raises:
         InputError: the cloud cannot be read, or is of an earlier model.
     """
-    path = result.folder / DENSE_CLOUD
-    if path.is_file():
-        _require_of_model(path, result)
+    path = find_dense_cloud(result.folder)
+    if path is not None:
         cloud = read_cloud(path)
         if len(cloud) < NEIGHBOURS:
             raise InputError(f"{path} has {len(cloud)} points only")
         return Surface(cloud.points, DENSE_CLOUD, cloud.stddev)
     return model_surface(result.model.scene)
-
-
-def _require_of_model(cloud: Path, result: Result) -> None:
-    """Refuse a cloud whose summary names another model; one without any is trusted."""
-    try:
-        summary = json.loads((cloud.parent / SUMMARY).read_text(encoding="utf-8"))
-        mark = summary["model"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return
-    if mark != result.fingerprint:
-        raise InputError(f"{cloud} is of an earlier model: run uwsfm dense again")
 
 
 def model_surface(scene: Scene) -> Surface:

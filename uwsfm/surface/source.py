@@ -13,7 +13,7 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import POINTS, SPARSE, SUMMARY, read_model, unit_of_model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import DENSE_CLOUD
+from uwsfm.result_folder import DENSE_CLOUD, find_dense_cloud
 from uwsfm.surface.level import Level, find_level
 
 
@@ -135,7 +135,7 @@ def find_source(path: str | Path) -> Source:
     """The dense cloud of a result folder, or its points if there is none; or a file.
 
     Raises:
-        InputError: neither is there.
+        InputError: neither is there, or the dense cloud is of an earlier model.
     """
     path = Path(path)
     if path.is_file():
@@ -145,7 +145,7 @@ def find_source(path: str | Path) -> Source:
         return Source(path=path, folder=None)
     if not path.is_dir():
         raise InputError(f"{path}: no such file or folder")
-    for name in (DENSE_CLOUD, POINTS):
-        if (path / name).is_file():
-            return Source(path=path / name, folder=path)
+    cloud = find_dense_cloud(path) or path / POINTS
+    if cloud.is_file():
+        return Source(path=cloud, folder=path)
     raise InputError(f"{path}: has neither {DENSE_CLOUD} nor {POINTS}")
