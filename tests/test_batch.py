@@ -9,10 +9,11 @@ import pytest
 import yaml
 from sfm_scenes import reduced_images, reduced_rig
 
-from uwsfm.batch import LOG
+from uwsfm.batch import LOG, run_batch
 from uwsfm.dives_file import load_dives
 from uwsfm.errors import InputError
 from uwsfm.rig_file import dump_rig
+from uwsfm.tasks import Workers
 
 DIVE = {"name": "bow", "rig": "rig.yaml", "images": "wreck/bow"}
 
@@ -71,6 +72,10 @@ def test_dives_inherit_options_and_find_their_files(tmp_path):
             [DIVE, {**DIVE, "name": "stern", "out": "./bow"}],
             r"dives\[1\].out: is that of dives\[0\]",
         ),
+        (
+            [{**DIVE, "out": "nn/b"}, {**DIVE, "name": "stern", "out": "nn"}],
+            r"dives\[0\].out: the folder of 'bow' is inside that of 'stern'",
+        ),
         ([{**DIVE, "name": "a/b"}], r"dives\[0\].name: must be the name of a folder"),
         ([], r"dives: there is none in the list"),
     ],
@@ -79,6 +84,16 @@ def test_what_is_wrong_with_a_file_is_said_with_its_key(tmp_path, dives, message
     path = written(tmp_path, {"version": 1, "dives": dives})
     with pytest.raises(InputError, match=f"{path}: .*{message}"):
         load_dives(path)
+
+
+def test_wrong_input_needs_no_workers_and_is_one_sentence_in_the_log(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(Workers, "outcomes", None)  # not to be called
+    (outcome,) = run_batch(written(tmp_path, {"version": 1, "dives": [DIVE]}))
+    assert "rig.yaml" in outcome.reason
+    log = (tmp_path / "bow" / LOG).read_text().splitlines()
+    assert log[-1].endswith(f"failed: {outcome.reason}") and len(log) == 2
 
 
 def small_dive(folder: Path, num_frames: int, scale: float = 0.4) -> None:

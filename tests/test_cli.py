@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,12 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
         cwd=cwd,
         check=False,
     )
+
+
+def test_version():
+    found = run("--version")
+    assert found.returncode == 0, found.stderr
+    assert found.stdout == f"uwsfm {metadata.version('uwsfm')}\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
@@ -153,7 +160,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     for folder in ("left", "right"):
         (tmp_path / folder).mkdir()
         for name in ("1.png", "2.png"):
-            (tmp_path / folder / name).write_bytes(b"")
+            (tmp_path / folder / name).write_bytes(b"x")
     (tmp_path / "out" / WORK).mkdir(parents=True)
     with FileLock(tmp_path / "out" / WORK / "lock"):
         _one_sentence(
@@ -260,6 +267,33 @@ def test_export_names_the_mistake(tmp_path, arguments, words):
     assert found.returncode == 2
     assert "'pdf' is not one of" in " ".join(found.stderr.split())
     assert not list(tmp_path.iterdir())
+
+
+STOPPED = """
+import os, signal, sys, time
+import numpy, pycolmap, typer
+from uwsfm import cli
+
+@cli.app.command()
+def wait():
+    from uwsfm.console import ProgressBars
+    with ProgressBars():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+sys.argv = ["uwsfm", "wait"]
+cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
+def test_sigterm_ends_in_the_sentence_of_an_interrupted_run():
+    """Not in a stack dump, which pycolmap's logging would print."""
+    found = subprocess.run(
+        [sys.executable, "-c", STOPPED], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 143
+    assert found.stderr == "interrupted; the same command resumes the run\n"
 
 
 def test_output_folder_that_is_a_file(tmp_path):

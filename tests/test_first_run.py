@@ -85,6 +85,14 @@ def test_a_home_that_cannot_be_written_moves_the_cache(tmp_path):
         assert found == hits
 
 
+def test_a_chosen_cache_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    process = start("import uwsfm._jit", UWSFM_CACHE_DIR=str(tmp_path / "file"))
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode != 0
+    assert f"UWSFM_CACHE_DIR: cannot write to {tmp_path / 'file'}" in errors
+
+
 @pytest.mark.slow
 def test_the_first_run_leaves_nothing_to_compile(tmp_path):
     images, cache = str(tmp_path / "images"), str(tmp_path / "cache")

@@ -63,7 +63,7 @@ def test_unmatched_images_are_counted_not_dropped_silently(image_dir, rig):
     frames = find_frames(image_dir, rig)
     assert frames.names == ("frame1.png", "frame10.png")
     (warning,) = frames.warnings()
-    assert "1 images were left out" in warning
+    assert warning.startswith("image ") and "was left out" in warning
     assert "right/frame2.png" in warning
 
 
@@ -87,6 +87,13 @@ def test_missing_folder_is_named_with_its_camera(image_dir, rig):
         find_frames(image_dir, rig)
     assert str(image_dir / "right") in sentence(error)
     assert "'right'" in sentence(error)
+
+
+def test_an_empty_image_file_is_named(image_dir, rig):
+    (image_dir / "right" / "frame2.png").write_bytes(b"")
+    with pytest.raises(InputError) as error:
+        find_frames(image_dir, rig)
+    assert "right/frame2.png is an empty file" in sentence(error)
 
 
 def test_empty_folder_is_named(image_dir, rig):
@@ -120,7 +127,7 @@ def test_white_space_in_a_name_is_refused(image_dir, rig):
         find_frames(image_dir, rig)
 
 
-@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
+@pytest.mark.parametrize("content", [b"not an image", b"\x89PNG\r\n\x1a\n"])
 def test_image_that_cannot_be_decoded_is_named(image_dir, rig, content):
     (image_dir / "right" / "frame2.png").write_bytes(content)
     with pytest.raises(InputError, match=r"right.frame2.png cannot be read"):

@@ -3,6 +3,7 @@
 import pytest
 
 from uwsfm._files import PARTIAL
+from uwsfm.errors import UwsfmError
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.steps import Steps
 
@@ -90,6 +91,13 @@ def test_missing_outputs_are_made_again_with_all_that_follows(chain):
     (chain.work_dir / "first").unlink()
     chain.run()
     assert chain.take() == ["clear first", "first", "second"]
+
+
+def test_an_emptied_output_is_damaged_not_a_new_database(chain):
+    (chain.work_dir / "first").write_text("")
+    with pytest.raises(UwsfmError, match="first is damaged: remove the folder"):
+        chain.run()
+    assert chain.take() == []
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"format": 0}'])

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from uwsfm._progress import Progress, silent
-from uwsfm.errors import InputError
+from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.joint_alignment import Link, align_jointly
@@ -25,9 +25,21 @@ from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.submaps.splitting import MIN_OVERLAP, split
+from uwsfm.sfm.submaps.submap import Submap, read_submaps
 from uwsfm.simulate import ObservationOptions, Relief, SimulatedScene, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import lawn_mower
+
+
+@pytest.mark.parametrize("kept", [0, 3, 100, -30])
+def test_a_part_that_was_cut_short_is_named(tmp_path, kept):
+    path = tmp_path / "000.npz"
+    names = [f"0.{name}" for name in Submap._fields]
+    np.savez(path, **{name: np.ones(20) for name in names})
+    assert len(read_submaps(path)) == 1
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(UwsfmError, match="000.npz is damaged: remove the folder"):
+        read_submaps(path)
 
 
 def lawn_links(num_lines: int, per_line: int) -> csr_array:

@@ -2,9 +2,9 @@
 
 Numba keys its cache by the file of the outermost function only, so an edit in a
 kernel's callee would go unnoticed. Keying the cache folder by the source of everything
-that kernels are made of makes stale code impossible; a folder that cannot be written
-(read-only home) moves to the temporary directory, and failing that, kernels compile in
-each process.
+that kernels are made of makes stale code impossible. Without a home that can be written
+it is in the temporary directory, and failing that, kernels compile in each process; a
+folder that the user chose is used or refused.
 """
 
 import hashlib
@@ -20,6 +20,8 @@ from filelock import FileLock
 from numba.core import config
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
+
+from uwsfm.errors import InputError
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -40,7 +42,8 @@ def _source_key() -> str:
 
 
 def _cache_dir() -> Path | None:
-    home = os.environ.get("UWSFM_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    chosen = os.environ.get("UWSFM_CACHE_DIR")
+    home = chosen or os.environ.get("XDG_CACHE_HOME")
     user = os.getuid() if hasattr(os, "getuid") else "user"
     candidates = [Path(home)] if home else []
     if not home:
@@ -53,8 +56,11 @@ def _cache_dir() -> Path | None:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
-        except OSError:
-            continue
+        except OSError as error:
+            if chosen:
+                raise InputError(
+                    f"UWSFM_CACHE_DIR: cannot write to {base}: {error.strerror}"
+                ) from None
     return None
 
 

@@ -13,9 +13,12 @@ from pathlib import Path
 
 from uwsfm._progress import Progress, silent
 from uwsfm.dives_file import Dive, load_dives
-from uwsfm.errors import UwsfmError
-from uwsfm.pipeline import output_folder, reconstruct
+from uwsfm.errors import InputError, UwsfmError
+from uwsfm.pipeline import checked_rig, output_folder, reconstruct
+from uwsfm.sfm.images import find_frames
 from uwsfm.tasks import LOCAL, Workers
+
+logger = logging.getLogger(__name__)
 
 LOG = "uwsfm.log"
 """In the output folder of each dive."""
@@ -65,18 +68,40 @@ def run_batch(
             if workers.elsewhere:
                 folder.mkdir(parents=True, exist_ok=True)
                 workers.require_sight(folder)
-        threads = 1
+        wrong: dict[int, Outcome] = {}
         if not workers.elsewhere:
-            threads = max(1, workers.num_processes // len(dives))
-        found = workers.outcomes(
-            run_dive, [(dive, threads) for dive in dives], "dives", progress
-        )
+            wrong = _refused(dives)
+        todo = [index for index in range(len(dives)) if index not in wrong]
+        threads = 1
+        if todo and not workers.elsewhere:
+            threads = max(1, workers.num_processes // len(todo))
+        outcomes: dict[int, Outcome | UwsfmError] = {**wrong}
+        if todo:
+            found = workers.outcomes(
+                run_dive,
+                [(dives[index], threads) for index in todo],
+                "dives",
+                lambda step, done, _: progress(step, len(wrong) + done, len(dives)),
+            )
+            outcomes.update(zip(todo, found, strict=True))
     return [
         outcome
         if isinstance(outcome, Outcome)
         else Outcome(name=dive.name, reason=str(outcome), seconds=float("nan"))
-        for dive, outcome in zip(dives, found, strict=True)
+        for dive, outcome in ((dive, outcomes[i]) for i, dive in enumerate(dives))
     ]
+
+
+def _refused(dives: Sequence[Dive]) -> dict[int, Outcome]:
+    """Dives whose rig or images cannot be used, told before any process starts."""
+    wrong = {}
+    for index, dive in enumerate(dives):
+        try:
+            find_frames(dive.images, checked_rig(dive.rig))
+        except InputError as error:
+            logger.warning("dive %s: %s", dive.name, error)
+            wrong[index] = run_dive(dive, 1)
+    return wrong
 
 
 def run_dive(dive: Dive, num_threads: int) -> Outcome:
@@ -96,6 +121,9 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
                     progress=_StepLog(log),
                     **dive.options,
                 )
+            except UwsfmError as error:
+                log.error("failed: %s", error)
+                raise
             except Exception:
                 log.error("%s", traceback.format_exc())
                 raise

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from uwsfm import _signals
 from uwsfm.cli_batch import batch
 from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
@@ -59,20 +60,30 @@ app.command()(view)
 FAILED, WRONG_INPUT = 1, 2
 
 
+def _print_version(wanted: bool) -> None:
+    """Its own callback: that of the group runs only once a command is known."""
+    if wanted:
+        from uwsfm import __version__
+
+        typer.echo(f"uwsfm {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def _global_options(
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Show COLMAP's own log.")
     ] = False,
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True)
+        bool,
+        typer.Option(
+            "--version",
+            help="Print the version.",
+            is_eager=True,
+            callback=_print_version,
+        ),
     ] = False,
 ) -> None:
-    if version:
-        from uwsfm import __version__
-
-        typer.echo(f"uwsfm {__version__}")
-        raise typer.Exit
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(message)s"
     )
@@ -144,6 +155,7 @@ def reconstruct(
     submap_frames: Annotated[
         int | None,
         typer.Option(
+            min=10,
             help="Longer surveys are mapped in parts of at most so many frames; "
             "default: 200 beyond 400.",
             show_default=False,
@@ -342,7 +354,8 @@ def _print_result(summary: dict) -> None:
     console.print(housing_table(summary))
     for warning in summary["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
-    console.print(timings_table(summary["timings_s"]))
+    earlier = summary.get("steps_of_earlier_runs", ())
+    console.print(timings_table(summary["timings_s"], earlier))
 
 
 def _print_housing(result: "HousingResult") -> None:
@@ -372,6 +385,10 @@ def main() -> None:
         _fail(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), FAILED)
     except MemoryError:
         _fail("out of memory", FAILED)
+    except SystemExit:
+        if _signals.received.is_set():
+            sys.exit(_signals.EXIT_CODE)
+        raise
 
 
 def _fail(message: str, code: int) -> None:

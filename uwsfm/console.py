@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -18,6 +18,8 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+from uwsfm._signals import raise_on_sigterm
 
 if TYPE_CHECKING:
     from uwsfm.batch import Outcome
@@ -42,12 +44,14 @@ class ProgressBars:
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> ProgressBars:
+        raise_on_sigterm()
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
         if failure is None:
             self._finish_others("")
-        self._progress.stop()
+        if self._tasks:  # else a blank line would be drawn
+            self._progress.stop()
         if failure is not None and issubclass(failure, KeyboardInterrupt):
             errors.print("interrupted; the same command resumes the run")
 
@@ -283,13 +287,15 @@ def batch_table(outcomes: Iterable[Outcome]) -> Table:
     return table
 
 
-def timings_table(timings: dict[str, float]) -> Table:
-    """Where the time went."""
-    total = sum(timings.values())
+def timings_table(timings: dict[str, float], earlier: Collection[str] = ()) -> Table:
+    """Where the time went; steps that an earlier run has done are not in the total."""
+    total = sum(seconds for step, seconds in timings.items() if step not in earlier)
     table = Table(title="Time", title_justify="left", show_header=False)
     for step, seconds in timings.items():
-        share = seconds / total if total else 0.0
-        table.add_row(step, f"{seconds:.1f} s", f"{share:.0%}")
+        share = "earlier run"
+        if step not in earlier:
+            share = f"{seconds / total if total else 0.0:.0%}"
+        table.add_row(step, f"{seconds:.1f} s", share)
     table.add_row("total", f"{total:.1f} s", "")
     return table
 

@@ -126,6 +126,7 @@ def load_dives(path: str | Path) -> list[Dive]:
     _once(path, "name", dives, lambda dive: dive.name)
     # Two spellings of one folder are one folder.
     _once(path, "out", dives, lambda dive: os.path.realpath(dive.out))
+    _apart(path, dives)
     return dives
 
 
@@ -157,3 +158,15 @@ def _once(path: Path, key: str, dives: list[Dive], of: Callable[[Dive], str]) ->
                 f"{path}: dives[{index}].{key}: is that of dives[{first[of(dive)]}]"
             )
         first[of(dive)] = index
+
+
+def _apart(path: Path, dives: list[Dive]) -> None:
+    """No dive writes into what another replaces."""
+    owner = {Path(os.path.realpath(dive.out)): dive.name for dive in dives}
+    for index, dive in enumerate(dives):
+        for folder in Path(os.path.realpath(dive.out)).parents:
+            if folder in owner:
+                raise InputError(
+                    f"{path}: dives[{index}].out: the folder of {dive.name!r} is "
+                    f"inside that of {owner[folder]!r}"
+                )

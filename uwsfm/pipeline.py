@@ -310,6 +310,7 @@ def _summary(
         "warnings": warnings,
         "images": recorded_images(images),
         "timings_s": timings,
+        "steps_of_earlier_runs": mapped.pop("steps_of_earlier_runs"),
         "versions": versions(),
     }
 
@@ -321,9 +322,11 @@ def _images_without_points(model: Model) -> list[str]:
     names = [model.image_name(c, f) for c, f in np.argwhere(~seen).tolist()]
     if not names:
         return []
+    which = f"{len(names)} images see no point of the result, for instance {names[0]}"
+    if len(names) == 1:
+        which = f"image {names[0]} sees no point of the result"
     return [
-        f"{len(names)} images see no point of the result, for instance {names[0]}: do "
-        "they show the scene, and were the images of their frame taken together?"
+        f"{which}: is the scene in view, and were the images of a frame taken together?"
     ]
 
 

@@ -225,6 +225,8 @@ def _sentence(problem: Any, entries: Mapping[str, type[Entry]]) -> str:
     if kind not in _WANTED:
         return problem["msg"]
     shown = "empty" if value is None else reprlib.repr(value)
+    if isinstance(value, bool):
+        shown = "yes (or true)" if value else "no (or false)"
     return f"must be {_WANTED[kind].format(**context)}, not {shown}"
 
 

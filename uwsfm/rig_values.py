@@ -88,6 +88,8 @@ def checked_unit(values: tuple[float, ...]) -> tuple[float, ...]:
 
 def checked_normal(values: tuple[float, ...]) -> tuple[float, ...]:
     """A port normal (3,), which goes from the camera to the water."""
+    if not any(values):
+        raise InputError("has no length: 0, 0, 1 is the optical axis")
     if values[2] <= 0:
         raise InputError(
             "points back at the camera (its z must be positive): the normal goes from "

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
-logging.getLogger("distributed").setLevel(logging.WARNING)
 
 LOCAL = "local"
 RETRIES = 2
@@ -166,6 +165,7 @@ class Workers:
         import dask
         from distributed import Client, LocalCluster, SubprocessCluster
 
+        _log_as_all_do()
         logger.info("starting %d worker processes", self.num_processes)
         scratch = processes.enter_context(
             tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
@@ -187,7 +187,11 @@ class Workers:
                 cluster = SubprocessCluster(
                     **common,
                     worker_kwargs=each,
-                    scheduler_kwargs={"idle_timeout": ORPHANED},
+                    scheduler_kwargs={
+                        "idle_timeout": ORPHANED,
+                        # Dask removes it at its end, if it gets there: our folder is.
+                        "scheduler_file": os.path.join(scratch, "scheduler.json"),
+                    },
                 )
         processes.callback(cluster.close)
         client = Client(cluster)
@@ -197,6 +201,7 @@ class Workers:
     def _connect(self) -> None:
         from distributed import Client
 
+        _log_as_all_do()
         with _quiet_dask():
             try:
                 client = Client(self.scheduler, timeout=CONNECT_SECONDS)
@@ -305,6 +310,11 @@ def _call(packed: tuple[list[str], bytes]) -> Any:
 
 def _sees(path: str) -> bool:
     return os.path.exists(path)
+
+
+def _log_as_all_do() -> None:
+    """Importing `distributed` made it tell the command lines of its processes."""
+    logging.getLogger("distributed").setLevel(logging.NOTSET)
 
 
 def _quiet_dask() -> ExitStack:

@@ -68,6 +68,7 @@ def write_with_report(
         why = f"{error}" if isinstance(error, InputError) else repr(error)
         summary["warnings"].append(f"the report could not be written: {why}")
     summary["timings_s"]["report"] = time.perf_counter() - clock
+    progress("report", 1, 1)
     write_json(summary, out / SUMMARY)
 
 

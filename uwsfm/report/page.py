@@ -56,6 +56,7 @@ def page_of(report: Report) -> str:
     template = environment.from_string(asset("report.html.j2"))
     scales = [scales_of(camera) for camera in report.residuals]
     summary = report.summary
+    earlier = summary.get("steps_of_earlier_runs", ())
     return template.render(
         report=report,
         summary=summary,
@@ -72,7 +73,11 @@ def page_of(report: Report) -> str:
         cost_unit=cost_unit(summary),
         last_solve=f"{summary['solves'][-1]['num_observations']} observations",
         frame_rows=_frame_rows(report),
-        total_s=max(sum(summary["timings_s"].values()), 1e-9),
+        earlier_steps=earlier,
+        total_s=max(
+            sum(s for step, s in summary["timings_s"].items() if step not in earlier),
+            1e-9,
+        ),
         css=Markup(asset("report.css")),
         js=Markup(asset("report.js")),
         plotly=Markup(get_plotlyjs()),

@@ -8,6 +8,8 @@ from concurrent.futures import TimeoutError as StillRunning
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
+from zipfile import BadZipFile
+from zlib import error as BadCompression
 
 import pycolmap
 
@@ -17,6 +19,8 @@ Result = TypeVar("Result")
 
 POLL_SECONDS = 0.2
 FATAL_ONLY = 3
+DAMAGE = (OSError, EOFError, ValueError, KeyError, BadZipFile, BadCompression)
+"""What numpy raises for a file of arrays that was cut short or overwritten."""
 
 
 @contextmanager

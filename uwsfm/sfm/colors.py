@@ -10,7 +10,7 @@ from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.background import damaged
+from uwsfm.sfm.background import DAMAGE, damaged
 from uwsfm.sfm.images import read_color
 
 Colors = NDArray[np.uint8]
@@ -68,7 +68,7 @@ def stored_point_colors(
         path = colors_path(colors_dir, image_names[camera][frame])
         try:
             return np.load(path)[keypoint_idx[rows]]
-        except (OSError, ValueError, IndexError):
+        except (*DAMAGE, IndexError):
             raise damaged(colors_dir) from None
 
     return _mean(scene, seen)

@@ -44,9 +44,12 @@ class Frames:
         """What the user should know, one sentence each."""
         if not self.unmatched:
             return []
+        reason = "the other cameras have no image of that name"
+        if len(self.unmatched) == 1:
+            return [f"image {self.unmatched[0]} was left out: {reason}"]
         return [
             f"{len(self.unmatched)} images were left out, for instance "
-            f"{self.unmatched[0]}: the other cameras have no image of that name"
+            f"{self.unmatched[0]}: {reason}"
         ]
 
     def fingerprint(self) -> list[Any]:
@@ -66,7 +69,8 @@ def find_frames(image_dir: Path, rig: Rig, min_num_frames: int = MIN_FRAMES) -> 
 
     Raises:
         InputError: a folder that is missing or holds no image, no common name, fewer
-            frames than ``min_num_frames``, or a file name that contains white space.
+            frames than ``min_num_frames``, a file name that contains white space, or a
+            file that is empty.
     """
     image_dir = Path(image_dir)
     if not image_dir.is_dir():
@@ -103,6 +107,8 @@ def find_frames(image_dir: Path, rig: Rig, min_num_frames: int = MIN_FRAMES) -> 
                 f"image {image_dir / image_name}: its name contains white space; "
                 "rename it"
             )
+        if (image_dir / image_name).stat().st_size == 0:
+            raise InputError(f"image {image_dir / image_name} is an empty file")
     return frames
 
 

@@ -19,7 +19,7 @@ import pycolmap
 from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.rig import Rig
-from uwsfm.sfm.background import opened, remove_database
+from uwsfm.sfm.background import DAMAGE, damaged, opened, remove_database
 from uwsfm.sfm.features import COLORS, extract_images, require_features
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks
@@ -152,9 +152,13 @@ def match_elsewhere(
     )
     with opened(database_path) as database, pycolmap.DatabaseTransaction(database):
         for block, path in zip(blocks, paths, strict=True):
-            with np.load(path) as stored:
-                for (a, b), name in zip(block, stored.files, strict=True):
-                    database.write_matches(a, b, stored[name])
+            try:
+                with np.load(path) as stored:
+                    matches = [stored[name] for name in stored.files]
+            except DAMAGE:
+                raise damaged(path) from None
+            for (a, b), found in zip(block, matches, strict=True):
+                database.write_matches(a, b, found)
     shutil.rmtree(folder)
 
 

@@ -194,15 +194,21 @@ def _observation_table(
 def real_keypoints(
     features_path: Path, frames: Frames, registered: Sequence[int]
 ) -> tuple[tuple[Array, ...], ...]:
-    """[camera][frame] -> (n, 2) keypoints of some frames, from their database."""
+    """[camera][frame] -> (n, 2) keypoints of some frames, from their database.
+
+    Raises:
+        UwsfmError: the database lacks an image.
+    """
     with opened(features_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
+        try:
+            wanted = [
+                [ids[frames.image_name(c, f)] for f in registered]
+                for c in range(len(frames.folders))
+            ]
+        except KeyError:
+            raise damaged(features_path) from None
         return tuple(
-            tuple(
-                database.read_keypoints(ids[frames.image_name(c, f)])[:, :2].astype(
-                    np.float64
-                )
-                for f in registered
-            )
-            for c in range(len(frames.folders))
+            tuple(database.read_keypoints(i)[:, :2].astype(np.float64) for i in camera)
+            for camera in wanted
         )

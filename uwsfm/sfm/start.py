@@ -145,6 +145,7 @@ def start_from_matches(
         )
         start = load_start(space.perspective, space.features, frames)
     start.summary["timings_s"] = steps.seconds()
+    start.summary["steps_of_earlier_runs"] = steps.of_earlier_runs()
     return start
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from uwsfm._files import PARTIAL, replaced_file
+from uwsfm.sfm.background import damaged
 
 FILE_NAME = "steps.json"
 FORMAT = 1
@@ -40,6 +41,7 @@ class Steps:
         _remove_partial_outputs(work_dir)
         self._path = work_dir / FILE_NAME
         self._records: dict[str, dict[str, Any]] = {}
+        self._ran: set[str] = set()
         try:
             content = json.loads(self._path.read_text(encoding="utf-8"))
         except (OSError, ValueError):  # none yet, or not ours: all steps run
@@ -65,12 +67,19 @@ class Steps:
                 left is still there, to continue from.
             outputs: Files and folders that it makes.
             clear: Removes what a run with other inputs left.
+
+        Raises:
+            UwsfmError: a file that a finished step made is empty.
         """
         key = fingerprint(inputs)
         record = self._records.get(name, {})
         same = record.get("fingerprint") == key
         done = same and record.get("finished", False)
         if done and all(path.exists() for path in outputs):
+            for path in outputs:
+                # SQLite would take it for a new database.
+                if path.is_file() and path.stat().st_size == 0:
+                    raise damaged(path)
             return key
         if clear is not None and (done or not same):
             clear()
@@ -83,6 +92,7 @@ class Steps:
         start = time.monotonic()
         action()
         seconds = time.monotonic() - start
+        self._ran.add(name)
         self._records[name].update(finished=True, seconds=round(seconds, 3))
         self._write()
         return key
@@ -94,6 +104,10 @@ class Steps:
             for name, record in self._records.items()
             if record["finished"]
         }
+
+    def of_earlier_runs(self) -> list[str]:
+        """Finished steps that were not run again."""
+        return [name for name in self.seconds() if name not in self._ran]
 
     def _write(self) -> None:
         content = {"format": FORMAT, "steps": self._records}

@@ -1,6 +1,7 @@
 """Simulated observations in one .npz file, readable with numpy alone."""
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import pycolmap
@@ -66,7 +67,7 @@ def read_observations(path: Path) -> SimulatedScene:
     try:
         with np.load(path) as file:
             data = {name: file[name] for name in ARRAYS}
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
         raise InputError(
             f"{path}: not a file of simulated observations: {error}"
         ) from None

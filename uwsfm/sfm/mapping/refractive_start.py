@@ -14,7 +14,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import port_from_row
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
-from uwsfm.sfm.background import damaged
+from uwsfm.sfm.background import DAMAGE, damaged
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.perspective import StartArrays, real_keypoints
@@ -70,7 +70,7 @@ class RefractiveStart:
         """
         try:
             stored = {n: np.load(self.map_path / f"{n}.npy") for n in ARRAYS}
-        except (OSError, ValueError):
+        except DAMAGE:
             raise damaged(self.map_path) from None
         registered = stored["registered"].tolist()
         keypoints = real_keypoints(self.features_path, self.frames, registered)

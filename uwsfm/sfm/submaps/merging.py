@@ -102,6 +102,7 @@ def merge_submaps(
     )
     with threadpool_limits(1, user_api="blas"):
         grower = Grower(growing, rig, MAX_ERROR_PX, options.seed, progress)
+        progress("merging", 1, 1)
         _set_housings(growing, [submaps[k] for k in chosen])
         beginning, source = _poses(placement, submaps, chosen)
         seam_px = _seam_px(growing, beginning, source)

@@ -12,7 +12,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import damaged
+from uwsfm.sfm.background import DAMAGE, damaged
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.mapping.incremental import map_incrementally
@@ -131,5 +131,5 @@ def read_submaps(path: Path) -> list[Submap]:
                 Submap(*(stored[f"{index}.{name}"] for name in Submap._fields))
                 for index in range(count)
             ]
-    except (OSError, ValueError, KeyError):
+    except DAMAGE:
         raise damaged(path) from None

@@ -12,6 +12,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
+from uwsfm.sfm.background import DAMAGE, damaged
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.submaps.splitting import split
@@ -72,9 +73,12 @@ def _input_path(folder: Path, index: int) -> Path:
 
 
 def read_all(folder: Path) -> list[Submap]:
-    """The maps of all parts; a part may have none, or several."""
-    with np.load(folder / PARTS) as stored:
-        count = len(stored.files)
+    """The maps of all parts; a part may have none, or several.
+
+    Raises:
+        UwsfmError: a file is damaged.
+    """
+    count = len(_read_parts(folder / PARTS))
     return [m for k in range(count) for m in read_submaps(submap_path(folder, k))]
 
 
@@ -87,5 +91,12 @@ def _parts(
         arrays = {f"{k:03d}": part.frames for k, part in enumerate(parts)}
         with replaced_file(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]
-    with np.load(path) as stored:
-        return [stored[name] for name in stored.files]
+    return _read_parts(path)
+
+
+def _read_parts(path: Path) -> list[IndexArray]:
+    try:
+        with np.load(path) as stored:
+            return [stored[name] for name in stored.files]
+    except DAMAGE:
+        raise damaged(path) from None
