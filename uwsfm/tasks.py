@@ -189,6 +189,7 @@ class Workers:
                     worker_kwargs=each,
                     scheduler_kwargs={
                         "idle_timeout": ORPHANED,
+                        "local_directory": scratch,
                         # Dask removes it at its end, if it gets there: our folder is.
                         "scheduler_file": os.path.join(scratch, "scheduler.json"),
                     },

@@ -24,8 +24,10 @@ from uwsfm.solver.state import State
 
 ITERATIONS = 10
 REFERENCE_US = {"pinhole, CPU": (2.9, 4.8), "refractive, CPU": (18.0, 22.0)}
-"""Per observation and iteration, COLMAP 4.2 and Refractive COLMAP, as measured on
-another day on a machine of this kind: what stands in where there is no binary."""
+"""Per observation and iteration, COLMAP 4.2 and Refractive COLMAP, where there is no
+binary. Measured on another day, on a machine of two cores, on other scenes, as CPU time
+of a whole call: 10 iterations of 200 images with 219,000 observations in 40 s, 5 of 500
+images with 750,000 in 84 s (COLMAP's pinholes 6.3 s and 18 s)."""
 
 
 def pinhole_colmap(num_frames: int, folder: str) -> dict[str, Any]:

@@ -186,9 +186,10 @@ def _peers(results: Results) -> Iterator[Outcome]:
             continue
         own = ours["one_thread"]["cpu_us_per_observation"]
         if peer and peer["refractive"]:
-            theirs, source = peer["us_per_observation"], "in this run"
+            theirs, source = peer["us_per_observation"], "measured in this run"
         elif frames == 500:
-            theirs, source = REFERENCE_US["refractive, CPU"][0], "elsewhere"
+            theirs = REFERENCE_US["refractive, CPU"][0]
+            source = "an older measurement on other scenes (see the README)"
         else:
             continue
         yield Outcome(
@@ -197,7 +198,7 @@ def _peers(results: Results) -> Iterator[Outcome]:
             unit="x",
             measured=theirs / own,
             at_least=True,
-            note=f"{theirs:.1f} us, measured {source}, against {own:.2f} us",
+            note=f"{theirs:.1f} us, {source}, against {own:.2f} us",
         )
 
 
