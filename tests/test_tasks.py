@@ -98,6 +98,60 @@ def test_where_no_scheduler_is_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
+STOPPED = """
+import psutil, time
+from uwsfm import cli
+
+@cli.app.command()
+def wait():
+    import pycolmap
+    from uwsfm.console import ProgressBars
+    from uwsfm.tasks import Workers
+
+    def start(step, done, total):
+        children = psutil.Process().children(recursive=True)
+        print(*[child.pid for child in children], flush=True)
+
+    with ProgressBars(), Workers(max_processes=2) as workers:
+        workers.run(nap, [(0,), (60,), (60,)], "naps", start)
+
+def nap(seconds):
+    import numpy, pycolmap
+    time.sleep(seconds)
+
+import sys
+sys.argv = ["uwsfm", "wait"]
+cli.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
+def test_a_signal_to_the_whole_group_ends_all_processes_without_a_word():
+    """As from `timeout` or a terminal: none of them complains that others are gone."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", STOPPED],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    process.stdout.readline()  # none has started
+    children = [int(word) for word in process.stdout.readline().split()]
+    assert len(children) >= 3  # a scheduler and two workers, with who watches them
+    os.killpg(process.pid, signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (
+        143,
+        "interrupted; the same command resumes the run\n",
+    )
+    deadline = time.monotonic() + 10.0  # they were killed; somebody has to notice
+    while any(psutil.pid_exists(child) for child in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
 ORPHANS = """
 import os, psutil, signal, time
 from uwsfm.tasks import Workers

@@ -67,8 +67,8 @@ class ProgressBars:
         """Steps run one after the other: a new one means that the last one is done."""
         for name, task in self._tasks.items():
             if name != step:
-                done = self._progress.tasks[task].completed
-                self._progress.update(task, completed=done, total=max(done, 1))
+                done = max(self._progress.tasks[task].completed, 1)
+                self._progress.update(task, completed=done, total=done)
 
 
 # Three numbers and their deviations side by side do not fit a narrow terminal.

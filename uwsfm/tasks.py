@@ -13,8 +13,8 @@ import os
 import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -35,6 +35,9 @@ CONNECT_SECONDS = 5
 ORPHANED = "30s"
 """Without a task, after which processes of this machine end: whoever started them was
 killed."""
+OWN_GROUP = "import os; os.setpgrp()"
+"""Ctrl-C and `timeout` mean whole groups: this process is to end the others, in order,
+before they complain of each other."""
 BYTES_PER_WORKER = 1.5e9
 """That a submap of 200 frames with 4000 features per image needs at its peak, about."""
 
@@ -180,14 +183,15 @@ class Workers:
             "local_directory": scratch,
             "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
         }
-        with dask.config.set({"temporary-directory": scratch}):
+        with _quiet_starts(), dask.config.set({"temporary-directory": scratch}):
             if sys.platform == "win32":  # where processes can only be spawned
                 cluster = LocalCluster(**common, **each)
             else:
                 cluster = SubprocessCluster(
                     **common,
-                    worker_kwargs=each,
+                    worker_kwargs={**each, "preload_nanny": [OWN_GROUP]},
                     scheduler_kwargs={
+                        "preload": [OWN_GROUP],
                         "idle_timeout": ORPHANED,
                         "local_directory": scratch,
                         # Dask removes it at its end, if it gets there: our folder is.
@@ -311,6 +315,20 @@ def _call(packed: tuple[list[str], bytes]) -> Any:
 
 def _sees(path: str) -> bool:
     return os.path.exists(path)
+
+
+@contextmanager
+def _quiet_starts() -> Iterator[None]:
+    """Processes that are started tell errors only, from their first line on."""
+    name = "DASK_LOGGING__DISTRIBUTED"
+    before = os.environ.get(name)
+    os.environ[name] = "error"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+        if before is not None:
+            os.environ[name] = before
 
 
 def _log_as_all_do() -> None:
