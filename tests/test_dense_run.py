@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import uwsfm
 from uwsfm.cli import app
 from uwsfm.dense import maps
-from uwsfm.errors import InputError
+from uwsfm.errors import InputError, UwsfmError
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +58,10 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     assert np.all(cloud.num_views >= 2)
 
 
+def _no_work(step: str, done: int, total: int) -> None:
+    raise AssertionError(f"{step} was begun")
+
+
 def test_wrong_input_is_told_in_one_sentence(dive: DenseDive, tmp_path):
     images = tmp_path / "images"
     shutil.copytree(dive.images, images)
@@ -66,11 +70,18 @@ def test_wrong_input_is_told_in_one_sentence(dive: DenseDive, tmp_path):
         ({"max_memory": 1e7}, "--max-memory 0.01GB is too little"),
         ({"voxels": 1}, "unknown option voxels"),
         ({"noise_px": -1.0}, "noise_px must be positive"),
+        ({"min_views": 99}, "--min-views 99: there are [0-9]+ depth maps"),
+        # No two depth maps agree to a millionth of a pixel.
+        ({"noise_px": 1e-9}, "no point is confirmed by 2 depth maps: of [1-9]"),
     ):
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(UwsfmError, match=words):
             uwsfm.dense_cloud(dive.out, images, **options)
     with pytest.raises(InputError, match="say with --images"):
         uwsfm.dense_cloud(dive.out)
+    last = sorted((images / "left").iterdir())[-1]
+    os.replace(last, tmp_path / "last")
+    with pytest.raises(InputError, match=last.name):
+        uwsfm.dense_cloud(dive.out, images, progress=_no_work)
     os.replace(first, tmp_path / "away")
     with pytest.raises(InputError, match=f"{first.name}"):
         uwsfm.dense_cloud(dive.out, images)

@@ -34,6 +34,24 @@ def replaced_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def require_writable(path: Path) -> None:
+    """Tell before the work what could not be written after it.
+
+    Args:
+        path: a file or folder that will be written; it need not exist.
+
+    Raises:
+        InputError: the nearest folder above it that exists is none, or is read-only.
+    """
+    folder = Path(path).absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"cannot write {path}: {folder} is no folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write {path}: {folder} is read-only")
+
+
 @contextmanager
 def replaced_dir(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``; it takes its place on success."""

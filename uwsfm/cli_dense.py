@@ -70,6 +70,10 @@ def dense(
             num_threads=threads,
         )
     console.print(_table(result.summary))
+    reused = sum(entry["reused"] for entry in result.summary["depth_maps"])
+    if reused:
+        done = f"{reused} of {len(result.summary['depth_maps'])} depth maps"
+        typer.echo(f"{done} were there from an earlier run; the fusion was repeated")
     typer.echo(f"wrote {result.path}")
 
 

@@ -18,6 +18,7 @@ from uwsfm.dense.sweep import Source, smallest_band, sweep_depth
 from uwsfm.dense.views import (
     View,
     cam_from_world,
+    image_path,
     load_image,
     slabs_of,
     stereo_views,
@@ -78,6 +79,16 @@ class DepthMaps:
         self._covariance = result.calibration.covariance
         self.errors: dict[tuple[int, int], CalibrationError | None] = {}
 
+    def require_images(self) -> None:
+        """Look for all images before the first is matched.
+
+        Raises:
+            InputError: one is missing.
+        """
+        for view in self.views:
+            for name in (view.name, *view.other_names):
+                image_path(self.images, name)
+
     def make(self, index: int, budget: float) -> dict[str, Any]:
         """Make a depth map unless it is there; what is known of it.
 
@@ -89,6 +100,7 @@ class DepthMaps:
         path, key = self._path(view), self._key(view)
         slabs = slabs_of(self.model, view) if view.is_stereo else ()
         depth = read_depth_map(path, key)
+        reused = depth is not None
         if depth is None:
             image = self._gray(view.camera, view.name)
             others = [
@@ -110,6 +122,7 @@ class DepthMaps:
             "num_slabs": len(slabs) or None,
             "deviation_px": max((slab.deviation_px for slab in slabs), default=None),
             "share_matched": depth.num_valid / depth.ranges.size,
+            "reused": reused,
         }
 
     def bytes_of(self, index: int) -> float:
@@ -151,12 +164,7 @@ class DepthMaps:
         ]
         files = []
         for name in (view.name, *view.other_names):
-            path = self.images / name
-            if not path.is_file():
-                raise InputError(
-                    f"image {path} is missing: say with --images where it is"
-                )
-            status = path.stat()
+            status = image_path(self.images, name).stat()
             files.append((name, status.st_size, status.st_mtime_ns))
         own = rigid3.inverse(cam_from_world(self.model, view.camera, view.frame))
         poses = [

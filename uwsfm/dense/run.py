@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uwsfm._files import require_writable
 from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
@@ -104,16 +105,33 @@ class _Run:
     def __exit__(self, *_: object) -> None:
         cv2.setNumThreads(self._cv_threads)
 
+    def check(self) -> None:
+        """What would fail after the work.
+
+        Raises:
+            InputError: one sentence.
+        """
+        count, wanted = len(self.views), self.options.min_views
+        if wanted > (max(count, 2) if self.options.keep_single else count):
+            there = "is 1 depth map" if count == 1 else f"are {count} depth maps"
+            raise InputError(f"--min-views {wanted}: there {there}")
+        most = self.options.max_neighbours + 1
+        if wanted > most:
+            raise InputError(
+                f"--min-views {wanted}: each depth map is compared with "
+                f"{most - 1} others, so that {most} can agree"
+            )
+        require_writable(self.result.folder / DENSE_CLOUD)
+        self.maps.require_images()
+
     def cloud(self) -> DenseResult:
+        self.check()
         matched = self._timed("depth maps", self._match_all)
         noise, assumed = self._timed("noise", self._noise)
         voxel = self.options.voxel or self._footprint()
         counts, cloud = self._timed("fusion", lambda: self._fuse_all(noise, voxel))
         if not len(cloud):
-            raise UwsfmError(
-                f"no point is confirmed by {self.options.min_views} depth maps: the "
-                f"{len(self.views)} frames overlap too little; try --min-views 1"
-            )
+            raise UwsfmError(self._why_empty(counts))
         path = self.result.folder / DENSE_CLOUD
         unit = self.result.unit
         write_cloud(cloud, path, unit)
@@ -139,6 +157,22 @@ class _Run:
         }
         write_json(summary, path.with_name(SUMMARY))
         return DenseResult(cloud=cloud, summary=summary, path=path)
+
+    def _why_empty(self, counts: dict[str, Any]) -> str:
+        contradicted = counts["num_contradicted"]
+        unchecked = counts["num_unchecked"]
+        if contradicted > unchecked and self.options.noise_px is not None:
+            advice = "try a larger --noise-px, or none"
+        elif contradicted > unchecked:
+            advice = "they disagree: is the rig's calibration right, do the images fit?"
+        else:
+            advice = "the frames overlap too little: try a smaller --min-views, or "
+            advice += "--keep-single"
+        return (
+            f"no point is confirmed by {self.options.min_views} depth maps: of "
+            f"{counts['num_measured']} depths, {contradicted} were contradicted by "
+            f"other depth maps and {unchecked} were seen by too few; {advice}"
+        )
 
     def _timed(self, step: str, action: Callable[[], Any]) -> Any:
         start = time.monotonic()

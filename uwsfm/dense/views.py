@@ -210,15 +210,25 @@ def _shared_points(scene: Scene):
     return (seen @ seen.T).tocsr()
 
 
+def image_path(folder: Path, name: str) -> Path:
+    """Of an image of the model.
+
+    Raises:
+        InputError: it is missing.
+    """
+    path = folder / name
+    if not path.is_file():
+        raise InputError(f"image {path} is missing: say with --images where it is")
+    return path
+
+
 def load_image(model: Model, folder: Path, camera: int, name: str):
     """An image (H, W, 3), blue, green, red.
 
     Raises:
         InputError: it is missing, damaged, or of another size than its camera's.
     """
-    path = folder / name
-    if not path.is_file():
-        raise InputError(f"image {path} is missing: say with --images where it is")
+    path = image_path(folder, name)
     image = read_color(path)
     lens = model.scene.cameras[camera]
     fault = size_fault(path, image, (lens.width, lens.height))

@@ -126,6 +126,8 @@ _ROW = np.dtype(
 
 def _merged(rows: np.ndarray) -> np.ndarray:
     """One row per key: sums, the most views, and the colour of the nearest view."""
+    if not len(rows):
+        return rows
     order = np.lexsort((rows["view_range"], rows["key"]))
     rows = rows[order]
     key = rows["key"]
