@@ -176,6 +176,14 @@ def test_what_the_images_do_not_determine_is_not_corrected(rng):
     factor = np.where(bright.image_idx == 2, 1.3, 1.0)[:, None]
     water = fit_water(replace(bright, light=bright.light * factor))
     assert any("differ in brightness" in text for text in water.warnings())
+    # Eleven times as large as slope and backscatter, and the same share of both: the
+    # quotient has no error to first order, and no bound where the backscatter is zero.
+    red = water.channels[0]
+    error = 11.0 * np.array([0.0, red.veil_slope, red.backscatter])
+    loose = replace(red, covariance=np.outer(error, error))
+    assert loose.veil[1] < 1e-6
+    open_water = replace(water, channels=(loose, *water.channels[1:]))
+    assert not open_water.summary()["channels"]["red"]["veil"]["determined"]
     with pytest.raises(UwsfmError, match="seen twice"):
         few = np.arange(20)
         fit_channel(bright.light[few, 0], bright.range[few], few, few)

@@ -216,6 +216,10 @@ def color(
             progress=progress,
         )
     _print_water(report)
+    typer.echo(
+        f"encoding: {report['encoding']}; say with --encoding if the images are "
+        "otherwise: a wrong one gives wrong numbers with small deviations"
+    )
     for warning in report["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
     written = [path.name for path in sorted(out.iterdir())]

@@ -87,7 +87,9 @@ def correct_colors(
             report |= _write_all(result, correction, samples, partial, wanted)
         write_json(report, partial / WATER)
     if problem is not None:
-        raise UwsfmError(f"{problem} (the estimates are in {target / WATER})")
+        raise UwsfmError(
+            f"{problem} (encoding {encoding}; the estimates are in {target / WATER})"
+        )
     return report
 
 

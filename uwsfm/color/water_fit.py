@@ -132,7 +132,7 @@ def _channel_summary(channel: ChannelFit) -> dict[str, Any]:
     names = ("attenuation_per_m", "veil_slope_per_m", "backscatter_per_m")
     entries = [*zip(names, values, channel.stddevs, strict=True)]
     entries.append(("veil", *channel.veil))
-    return {
+    found = {
         name: {
             "value": float(value) if math.isfinite(value) else None,
             "stddev": float(stddev) if math.isfinite(stddev) else None,
@@ -140,6 +140,10 @@ def _channel_summary(channel: ChannelFit) -> dict[str, Any]:
         }
         for name, value, stddev in entries
     }
+    # Veil of open water is slope over backscatter. Errors as large as these two
+    # themselves may cancel to first order, but a backscatter near zero has no bound.
+    found["veil"]["determined"] &= found["backscatter_per_m"]["determined"]
+    return found
 
 
 def fit_water(samples: Samples) -> Water:

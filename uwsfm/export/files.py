@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm._files import replaced_dir
+from uwsfm._files import replaced_dir, require_writable
 from uwsfm._ply import write_ply
 from uwsfm.colmap import (
     Model,
@@ -46,9 +46,10 @@ def checked_target(path: str | Path) -> Path:
     """Where an export may be written: never over anything.
 
     Raises:
-        InputError: there is something already.
+        InputError: there is something already, or nothing can be written there.
     """
     target = Path(path)
+    require_writable(target)
     if target.exists() and not (target.is_dir() and not any(target.iterdir())):
         raise InputError(f"{target} exists already: name another place with --out")
     return target
