@@ -75,7 +75,8 @@ class ChannelFit:
             return np.nan, np.nan
         value = self.veil_slope / self.backscatter
         gradient = np.array([0.0, 1.0, -value]) / self.backscatter
-        return value, float(np.sqrt(gradient @ self.covariance @ gradient))
+        variance = max(float(gradient @ self.covariance @ gradient), 0.0)
+        return value, float(np.sqrt(variance))
 
     def veil_at(self, ranges: Array) -> Array:
         """Light scattered towards the camera over ranges (any shape)."""

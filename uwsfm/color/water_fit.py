@@ -132,7 +132,7 @@ def _channel_summary(channel: ChannelFit) -> dict[str, Any]:
     names = ("attenuation_per_m", "veil_slope_per_m", "backscatter_per_m")
     entries = [*zip(names, values, channel.stddevs, strict=True)]
     entries.append(("veil", *channel.veil))
-    found = {
+    found: dict[str, dict[str, Any]] = {
         name: {
             "value": float(value) if math.isfinite(value) else None,
             "stddev": float(stddev) if math.isfinite(stddev) else None,
