@@ -80,13 +80,13 @@ def test_a_relief_comes_back_level_at_its_place_with_its_hole(tmp_path: Path, rn
     make_map(tmp_path / "cloud.ply", tmp_path / "map")
     report = json.loads((tmp_path / "map" / "map.json").read_text())
     # The fourth neighbour of points at random is 1.09 spacings away, rounded up.
-    assert SPACING <= report["resolution_m"] <= 1.2 * SPACING
+    assert SPACING <= report["resolution"] <= 1.2 * SPACING
     place, height, rgba = read_grid(tmp_path / "map")
     there = np.isfinite(height)
     np.testing.assert_array_equal(rgba[..., 3], np.where(there, 255, 0))
     in_map = np.concatenate([place[there], height[there][:, None]], axis=1)
     pose = report["world_from_map"]
-    world_from_map = np.array(pose["rotation_xyzw"] + pose["translation_m"])
+    world_from_map = np.array(pose["rotation_xyzw"] + pose["translation"])
     in_world = rigid3.transform(world_from_map, in_map.astype(np.float64))
     in_floor = rigid3.transform(rigid3.inverse(WORLD_FROM_FLOOR), in_world)
     # Linear interpolation errs by the triangle's side squared / 8 times the curvature,
@@ -100,7 +100,7 @@ def test_a_relief_comes_back_level_at_its_place_with_its_hole(tmp_path: Path, rn
     # The hole is there, but for its rim; the floor around it has no other.
     distance = np.linalg.norm(in_floor[:, :2] - [0.6, 0.3], axis=1)
     assert distance.min() > HOLE - SPACING
-    area = np.count_nonzero(there) * report["resolution_m"] ** 2
+    area = np.count_nonzero(there) * report["resolution"] ** 2
     assert area == pytest.approx(2.0 * 1.4 - np.pi * HOLE**2, rel=0.04)
     # Up is where the normals point.
     up = rigid3.rotate(world_from_map, np.array([[0.0, 0.0, 1.0]]))[0]
@@ -165,6 +165,7 @@ def test_points_of_a_result_are_cleaned_exported_and_mapped(tmp_path: Path):
     ] == "standard deviation / range"
     said = run("export", good, "-o", tmp_path / "good.laz", "--to", "laz")
     assert f"{report['num_kept']} points" in said
+    assert "scale of this reconstruction is arbitrary" in " ".join(said.split())
     said = run("map", out, "-o", tmp_path / "map")
     assert "scale of this reconstruction is arbitrary" in " ".join(said.split())
     # The world's z points down: cameras are above, so the map is turned over.

@@ -58,7 +58,7 @@ def test_other_libraries_read_the_files(floor, open3d, tmp_path: Path):
     folder = tmp_path / "mesh"
     assert json.loads((folder / "mesh.json").read_text()) == report
     assert report["web"]["num_triangles"] <= 1000 < report["mesh"]["num_triangles"]
-    assert report["mesh"]["farthest_from_points_m"] <= report["max_distance_m"]
+    assert report["mesh"]["farthest_from_points"] <= report["max_distance"]
     ply = open3d.t.io.read_triangle_mesh(str(folder / "mesh.ply"))
     vertices = ply.vertex.positions.numpy()
     triangles = ply.triangle.indices.numpy()

@@ -42,11 +42,10 @@ def export(
     if images is not None and to != "pinhole":
         raise InputError(f"--images: --to {to} writes no images")
     if to in ("las", "laz"):
-        from uwsfm.surface.commands import export_las
-
-        cloud = export_las(model, out, to)
-        typer.echo(f"wrote {out}: {len(cloud)} points")
+        _export_las(model, out, to)
         return
+    if model.is_file():
+        raise InputError(f"{model} is a file: only --to las and laz take a PLY")
     found = read_model(model)
     if to == "pinhole":
         _export_pinhole(found, out, images)
@@ -59,6 +58,19 @@ def export(
 
         export_scene_ply(found, out, unit=unit_of_model(model))
     typer.echo(f"wrote {out}")
+
+
+def _export_las(source: Path, out: Path, suffix: str) -> None:
+    from rich.markup import escape
+
+    from uwsfm.console import console
+    from uwsfm.surface.commands import export_las
+    from uwsfm.surface.source import find_source
+
+    cloud = export_las(source, out, suffix)
+    for warning in find_source(source).warnings():
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    typer.echo(f"wrote {out}: {len(cloud)} points")
 
 
 def _export_pinhole(model: "Model", out: Path, images: Path | None) -> None:

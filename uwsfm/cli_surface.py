@@ -106,6 +106,7 @@ def mesh(
 
     from uwsfm.console import console
     from uwsfm.surface.commands import mesh_cloud
+    from uwsfm.surface.units import length_words
 
     report = mesh_cloud(
         source,
@@ -115,11 +116,11 @@ def mesh(
         up=up,
         web_triangles=web_triangles,
     )
-    short = "m" if report["unit"] == "metre" else "of an arbitrary unit"
+    farthest = length_words(report["max_distance"], report["unit"])
     typer.echo(
         f"{report['mesh']['num_triangles']} triangles "
         f"({report['web']['num_triangles']} in web.glb), none further than "
-        f"{report['max_distance_m']:.2g} {short} from a point; glTF: {report['gltf']}, "
+        f"{farthest} from a point; glTF: {report['gltf']}, "
         f"{report['level']}"
     )
     for warning in report["warnings"]:
@@ -154,12 +155,13 @@ def map_(
 
     from uwsfm.console import console
     from uwsfm.surface.commands import make_map
+    from uwsfm.surface.units import length_words
 
     report = make_map(source, out, up=up, resolution=resolution, max_gap=max_gap)
-    short = "m" if report["unit"] == "metre" else "of an arbitrary unit"
+    cell = length_words(report["resolution"], report["unit"])
     typer.echo(
         f"{report['num_columns']} x {report['num_rows']} cells of "
-        f"{report['resolution_m']:g} {short}, {report['share_with_data']:.0%} with "
+        f"{cell}, {report['share_with_data']:.0%} with "
         f"data; {report['level']}"
     )
     for warning in report["warnings"]:

@@ -117,10 +117,10 @@ def height_errors(model: uwsfm.Model, work: Path, floor, spec) -> np.ndarray:
     report = json.loads((work / "map" / "map.json").read_text())
     height = tifffile.imread(work / "map" / "height.tif")
     row, column = np.indices(height.shape) + 0.5
-    x = report["west_m"] + report["resolution_m"] * column
-    y = report["north_m"] - report["resolution_m"] * row
+    x = report["west"] + report["resolution"] * column
+    y = report["north"] - report["resolution"] * row
     pose = report["world_from_map"]
-    world_from_map = np.array(pose["rotation_xyzw"] + pose["translation_m"])
+    world_from_map = np.array(pose["rotation_xyzw"] + pose["translation"])
     # The floor is where the first estimated pose is the true one.
     true_from_world = rigid3.compose(
         rigid3.inverse(spec.rig_from_world[0]), model.scene.rig_from_world[0]
@@ -174,8 +174,8 @@ def draw_colors(shown: list[np.ndarray], path: Path) -> None:
 
 def draw_surface(work: Path, errors: np.ndarray, path: Path) -> None:
     report = json.loads((work / "map" / "map.json").read_text())
-    side = report["resolution_m"]
-    west, north = report["west_m"], report["north_m"]
+    side = report["resolution"]
+    west, north = report["west"], report["north"]
     extent = (
         west,
         west + side * report["num_columns"],
@@ -220,14 +220,14 @@ def main() -> None:
     grid, mesh = reports["map"], reports["mesh"]
     print(
         f"map: {grid['num_columns']} x {grid['num_rows']} cells of "
-        f"{1e3 * grid['resolution_m']:.2g} mm, {grid['share_with_data']:.0%} with "
+        f"{1e3 * grid['resolution']:.2g} mm, {grid['share_with_data']:.0%} with "
         f"data; off by {1e3 * np.median(there):.2f} mm (median), "
         f"{1e3 * np.percentile(there, 90):.2f} mm (90 %)"
     )
     print(
         f"mesh: {mesh['mesh']['num_triangles']} triangles, "
-        f"{mesh['mesh']['area_m2']:.2f} m2, at most "
-        f"{1e3 * mesh['max_distance_m']:.1f} mm from a point; cleaned: "
+        f"{mesh['mesh']['area']:.2f} m2, at most "
+        f"{1e3 * mesh['max_distance']:.1f} mm from a point; cleaned: "
         f"{reports['clean']['num_kept']} of {reports['clean']['num_points']} points"
     )
     draw_colors(shown, work / "color.png")

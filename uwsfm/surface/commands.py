@@ -14,6 +14,7 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
 from uwsfm.surface.clean import clean_points, default_options
 from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
 from uwsfm.surface.height_map import make_height_map
@@ -24,6 +25,7 @@ from uwsfm.surface.mesh_files import write_glb, write_mesh_ply, write_obj
 from uwsfm.surface.packages import import_package
 from uwsfm.surface.preview import write_preview
 from uwsfm.surface.source import find_source
+from uwsfm.surface.units import length_words
 
 
 def clean_cloud(
@@ -94,7 +96,7 @@ def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
     """
     target = checked_target(path)
     if target.suffix.lower() != f".{suffix}":
-        raise InputError(f"{target}: the name of a file for --to {suffix} ends in it")
+        raise InputError(f"{target}: for --to {suffix} the name must end in .{suffix}")
     found = find_source(source)
     cloud = found.cloud()
     write_las(cloud, target, found.unit)
@@ -141,7 +143,7 @@ def mesh_cloud(
         "unit": found.unit,
         "method": method,
         "num_points": len(cloud),
-        "max_distance_m": reach,
+        "max_distance": reach,
         "gltf": "metres, +y up" if found.unit == "metre" else "no metres, +y up",
         "level": level.method,
         "warnings": found.warnings(),
@@ -150,8 +152,8 @@ def mesh_cloud(
         report[name] = {
             "num_vertices": len(part.vertices),
             "num_triangles": len(part.triangles),
-            "area_m2": part.area(),
-            "farthest_from_points_m": float(distances_to_cloud(part, cloud).max()),
+            "area": part.area(),
+            "farthest_from_points": float(distances_to_cloud(part, cloud).max()),
         }
     with replaced_dir(target) as partial:
         write_mesh_ply(mesh, partial / "mesh.ply", found.unit)
@@ -181,7 +183,9 @@ def make_map(
         max_gap: longest distance between points to bridge; default: five spacings.
 
     Returns:
-        What map.json holds.
+        What map.json holds, lengths in its "unit". Heights have no standard deviation
+        of their own: "point_stddev_percentiles" is of the cloud's points along their
+        lines of sight, "relief_about_plane" the scatter of the floor itself.
 
     Raises:
         InputError: nothing to read, something to write over, or up is not known.
@@ -194,31 +198,42 @@ def make_map(
     cloud = found.cloud()
     level = found.level(cloud, up)
     points = rigid3.transform(level.map_from_world, cloud.points)
-    grid = make_height_map(points, cloud.colors, resolution, max_gap)
+    grid = make_height_map(points, cloud.colors, resolution, max_gap, found.unit)
     pose = world_from_map(level)
     report = {
         "source": str(found.path),
         "unit": found.unit,
         "level": level.method,
-        "plane_stddev_m": level.plane_stddev,
-        "resolution_m": grid.resolution,
-        "max_gap_m": grid.max_gap,
-        "west_m": grid.west,
-        "north_m": grid.north,
+        "relief_about_plane": level.relief,
+        "point_stddev_percentiles": _percentiles(cloud.stddev),
+        "resolution": grid.resolution,
+        "max_gap": grid.max_gap,
+        "west": grid.west,
+        "north": grid.north,
         "num_rows": grid.height.shape[0],
         "num_columns": grid.height.shape[1],
         "share_with_data": float(np.mean(np.isfinite(grid.height))),
         "world_from_map": {
             "rotation_xyzw": pose[:4].tolist(),
-            "translation_m": pose[4:].tolist(),
+            "translation": pose[4:].tolist(),
         },
         "warnings": found.warnings(),
     }
     frame = f"uwsfm local frame, {level.method}"
-    title = f"{level.method}; cells {grid.resolution:g}, gaps up to {grid.max_gap:.2g}"
+    cell, gap = (length_words(x, found.unit) for x in (grid.resolution, grid.max_gap))
+    title = f"{level.method}; cells {cell}, gaps up to {gap}"
     with replaced_dir(target) as partial:
         write_height_tiff(grid, partial / "height.tif", frame, found.unit)
         write_color_tiff(grid, partial / "ortho.tif", frame, found.unit)
         write_preview(grid, partial / "map.png", title, found.unit)
         write_json(report, partial / "map.json")
     return report
+
+
+def _percentiles(stddev: Array) -> dict[str, float] | None:
+    known = stddev[np.isfinite(stddev)]
+    if not len(known):
+        return None
+    shares = (5, 50, 95)
+    found = np.percentile(known, shares).tolist()
+    return dict(zip(map(str, shares), found, strict=True))

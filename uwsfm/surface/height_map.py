@@ -9,6 +9,7 @@ from threadpoolctl import ThreadpoolController
 
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.surface.units import length_words
 
 _THREADS = ThreadpoolController()
 _NUM_SAMPLED = 20_000
@@ -64,6 +65,7 @@ def make_height_map(
     colors: NDArray[np.uint8],
     resolution: float | None = None,
     max_gap: float | None = None,
+    unit: str = "metre",
 ) -> HeightMap:
     """Heights and colours of a cloud in the frame of the map.
 
@@ -77,6 +79,7 @@ def make_height_map(
         colors: (N, 3) RGB.
         resolution: side of a cell; default: the spacing of the points.
         max_gap: default: five times the spacing, or two cells if that is more.
+        unit: of lengths, for messages.
 
     Raises:
         InputError: a length that is not positive, or too many cells.
@@ -96,7 +99,8 @@ def make_height_map(
     columns, rows = (high - low).astype(np.int64).tolist()
     if columns * rows > MAX_CELLS:
         raise InputError(
-            f"a map of {columns} x {rows} cells of {cell:g} is too large: take a "
+            f"a map of {columns} x {rows} cells of "
+            f"{length_words(cell, unit)} is too large: take a "
             "larger --resolution, or clean the cloud of strays first (uwsfm clean)"
         )
     west, north = float(low[0] * cell), float(high[1] * cell)

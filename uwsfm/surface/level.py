@@ -38,7 +38,7 @@ class Level:
     """(7,) pose; the map's z points up."""
     method: str
     """In words."""
-    plane_stddev: float | None = None
+    relief: float | None = None
     """Robust scatter of the points about the plane, if that is what is level."""
 
 
@@ -77,7 +77,7 @@ def level_by_plane(points: Array, above: Array) -> Level:
     return Level(
         map_from_world=pose,
         method="the plane through the points is level",
-        plane_stddev=scatter,
+        relief=scatter,
     )
 
 
