@@ -137,7 +137,7 @@ def test_places_of_a_dense_cloud_are_measured(dense):
         )
 
 
-def test_a_cloud_of_an_earlier_model_is_refused(dense):
+def test_a_cloud_of_another_model_is_refused(dense):
     opened, surface = dense
     place = ",".join(f"{v:.4f}" for v in surface[1200])
     summary = opened.folder / "dense" / "summary.json"
@@ -145,9 +145,9 @@ def test_a_cloud_of_an_earlier_model_is_refused(dense):
     summary.write_text(json.dumps({"model": opened.fingerprint}))
     assert uwsfm.measure(opened, content).measurements[0].value > 0.0
     summary.write_text(json.dumps({"model": "another"}))
-    with pytest.raises(InputError, match="is of an earlier model: run uwsfm dense"):
+    with pytest.raises(InputError, match="is of another model: run uwsfm dense"):
         uwsfm.measure(opened, content)
-    with pytest.raises(InputError, match="is of an earlier model: run uwsfm dense"):
+    with pytest.raises(InputError, match="is of another model: run uwsfm dense"):
         find_source(opened.folder)  # of maps, meshes, cleaned and exported clouds
     summary.unlink()
 

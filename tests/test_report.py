@@ -20,6 +20,7 @@ from uwsfm.pipeline import reconstruct
 from uwsfm.report.command import command_line
 from uwsfm.report.files import FOLDER, NUMBERS, PAGE, write_with_report
 from uwsfm.report.gather import gather
+from uwsfm.report.left_files import left_files
 from uwsfm.report.page import page_of
 from uwsfm.report.tables import frame_stddevs
 from uwsfm.report.view import MAX_POINTS, view_of
@@ -223,6 +224,31 @@ def test_what_other_commands_left_is_named(dive_result, tmp_path):
         "measured.json",
     ]
     assert '<a href="my%20reef.glb">my reef.glb</a>' in page_of(report)
+
+
+def test_the_dense_cloud_is_told_with_its_numbers_or_as_another_model_s(
+    dive_result, tmp_path
+):
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    (out / "dense").mkdir(exist_ok=True)
+    (out / "dense" / "cloud.ply").write_bytes(b"")
+    dense = {
+        "model": uwsfm.open_result(out).fingerprint,
+        "num_points": 1234,
+        "stddev_percentiles": {"5": 2e-4, "50": 4e-4, "95": 8e-4},
+        "noise_px": 0.1,
+        "noise_from": "differences between depth maps",
+        "depth_maps": [{"share_matched": 0.7}, {"share_matched": 0.9}],
+    }
+    for model, words in (
+        (dense["model"], "1234 points; standard deviation along the sight 0.2, 0.4, "),
+        ("f" * 64, "of another model: run uwsfm dense again"),
+    ):
+        text = json.dumps({**dense, "model": model})
+        (out / "dense" / "summary.json").write_text(text)
+        told = dict(left_files(out, "report", "mm", 1e3))["dense/cloud.ply"]
+        assert words in told
 
 
 def test_view_tells_where_the_page_is(dive_result, tmp_path):

@@ -110,7 +110,7 @@ def find_dense_cloud(folder: Path) -> Path | None:
     except (OSError, ValueError, KeyError, TypeError):
         return cloud  # it names no model, so that it was put there by hand
     if mark != fingerprint(folder / SPARSE, folder / HOUSING):
-        raise InputError(f"{cloud} is of an earlier model: run uwsfm dense again")
+        raise InputError(f"{cloud} is of another model: run uwsfm dense again")
     return cloud
 
 

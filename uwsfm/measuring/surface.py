@@ -86,7 +86,7 @@ def surface_of(result: Result) -> Surface:
     """The dense cloud of a result; else the points of its model.
 
     Raises:
-        InputError: the cloud cannot be read, or is of an earlier model.
+        InputError: the cloud cannot be read, or is of another model.
     """
     path = find_dense_cloud(result.folder)
     if path is not None:

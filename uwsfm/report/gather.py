@@ -10,24 +10,13 @@ import numpy as np
 
 from uwsfm.calibration.problem import Covariance
 from uwsfm.colmap import Model
-from uwsfm.export.files import POINTS, SPARSE, WORK
+from uwsfm.report.left_files import left_files
 from uwsfm.report.residuals import FEWEST, CameraResiduals, camera_residuals
 from uwsfm.report.tables import Estimate, Frame, estimates, frames
 from uwsfm.report.view import View, view_of
 from uwsfm.report.words import Verdict, small_lengths, unit_of, verdict_of
 
 PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"
-OTHER_FILES = {
-    ".ply": "cloud or mesh",
-    ".las": "cloud",
-    ".laz": "cloud",
-    ".obj": "mesh",
-    ".glb": "mesh for the web",
-    ".tif": "map",
-}
-"""What other commands may have left in the output folder or in folders in it."""
-_OWN = {SPARSE, POINTS, FOLDER, WORK}
-MEASURED = "measure*.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,20 +81,7 @@ def gather(
         coverage=tuple(_coverage(model, names.index(r.name), r) for r in residuals),
         frames=frames(model, covariance),
         summary=summary,
-        other_files=_other_files(out),
-    )
-
-
-def _other_files(out: Path) -> tuple[tuple[str, str], ...]:
-    found = [
-        (path, OTHER_FILES[path.suffix])
-        for path in sorted([*out.glob("*.*"), *out.glob("*/*.*")])
-        if path.suffix in OTHER_FILES and path.is_file()
-    ]
-    found += [(path, "measurements") for path in sorted(out.glob(MEASURED))]
-    places = [(path.relative_to(out), what) for path, what in found]
-    return tuple(
-        (path.as_posix(), what) for path, what in places if path.parts[0] not in _OWN
+        other_files=left_files(out, FOLDER, small_unit, small_scale),
     )
 
 

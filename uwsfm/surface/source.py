@@ -135,7 +135,7 @@ def find_source(path: str | Path) -> Source:
     """The dense cloud of a result folder, or its points if there is none; or a file.
 
     Raises:
-        InputError: neither is there, or the dense cloud is of an earlier model.
+        InputError: neither is there, or the dense cloud is of another model.
     """
     path = Path(path)
     if path.is_file():
