@@ -1,11 +1,14 @@
 """The cache of kernels: several processes, homes that cannot be written, no rest."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import uwsfm
 
 # Compiles one small kernel; says where it is kept, and whether it was there already.
 SMALL = """
@@ -69,6 +72,17 @@ def test_processes_that_start_cold_together_share_one_cache(tmp_path):
     assert Path(folders.pop()).is_relative_to(tmp_path)
     later = output(start(SMALL, UWSFM_CACHE_DIR=str(tmp_path)))
     assert later.split()[1] == "1"
+
+
+def test_another_installation_keeps_kernels_of_its_own(tmp_path):
+    """Numba would not take those of the first, though nothing differs but the place."""
+    package = Path(uwsfm.__file__).parent
+    shutil.copytree(package, tmp_path / "other" / "uwsfm", copy_function=shutil.copy2)
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from uwsfm import _jit;"
+    code += "print(_jit.CACHE_DIR)"
+    places = [str(package.parent), str(tmp_path / "other")]
+    runs = [start(code, place, UWSFM_CACHE_DIR=str(tmp_path)) for place in places]
+    assert len({output(run) for run in runs}) == 2
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="homes are named otherwise")

@@ -2,9 +2,11 @@
 
 Numba keys its cache by the file of the outermost function only, so an edit in a
 kernel's callee would go unnoticed. Keying the cache folder by the source of everything
-that kernels are made of makes stale code impossible. Without a home that can be written
-it is in the temporary directory, and failing that, kernels compile in each process; a
-folder that the user chose is used or refused.
+that kernels are made of makes stale code impossible. Files elsewhere, or touched, and
+other processors are other code to numba too: with them in the key, a folder that says it
+is complete is so for whoever reads it. Without a home that can be written it is in the
+temporary directory, and failing that, kernels compile in each process; a folder that the
+user chose is used or refused.
 """
 
 import hashlib
@@ -17,6 +19,7 @@ from typing import Any, TypeVar
 
 import numba
 from filelock import FileLock
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba.core import config
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
@@ -31,12 +34,13 @@ _KERNEL_FOLDERS = ("geometry", "models", "residuals", "solver")
 
 
 def _source_key() -> str:
-    digest = hashlib.sha1(numba.__version__.encode())
-    root = Path(__file__).parent
+    root = Path(__file__).parent.resolve()
+    machine = (get_host_cpu_name(), get_host_cpu_features().flatten())
+    digest = hashlib.sha1(repr((numba.__version__, *machine, str(root))).encode())
     for path in sorted(root.rglob("*.py")):
         name, source = path.relative_to(root), path.read_bytes()
         if name.parts[0] in _KERNEL_FOLDERS or b"uwsfm._jit" in source:
-            digest.update(name.as_posix().encode())
+            digest.update(f"{name.as_posix()} {path.stat().st_mtime_ns}".encode())
             digest.update(source)
     return digest.hexdigest()[:16]
 
