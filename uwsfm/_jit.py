@@ -3,10 +3,10 @@
 Numba keys its cache by the file of the outermost function only, so an edit in a
 kernel's callee would go unnoticed. Keying the cache folder by the source of everything
 that kernels are made of makes stale code impossible. Files elsewhere, or touched, and
-other processors are other code to numba too: with them in the key, a folder that says it
-is complete is so for whoever reads it. Without a home that can be written it is in the
-temporary directory, and failing that, kernels compile in each process; a folder that the
-user chose is used or refused.
+other processors are other code to numba too: with them in the key, a folder that says
+it is complete is so for whoever reads it. Without a home that can be written it is in
+the temporary directory, and failing that, kernels compile in each process; a folder
+that the user chose is used or refused.
 """
 
 import hashlib
