@@ -16,7 +16,7 @@ from uwsfm.cli import app
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.console import console
 from uwsfm.geometry import rigid3
-from uwsfm.measuring.measure import agreement
+from uwsfm.measuring.measure import agreement, unit_hint
 from uwsfm.measuring.surface import Surface, SurfaceImage
 from uwsfm.measuring.table import measurement_table, rounded
 from uwsfm.surface.source import find_source
@@ -291,6 +291,12 @@ def test_words_and_digits():
     assert rounded(1234.5, 120.0) == "1234 ± 120"
 
 
+def test_a_length_in_another_unit_is_guessed():
+    assert unit_hint(120.0, 0.1203) == "1000 times what was measured: millimetres?"
+    assert unit_hint(0.0012, 0.1203) == "100 times too short: is it in metres?"
+    assert unit_hint(0.13, 0.1203) is None
+
+
 def test_command_line(dive_result, spots, tmp_path, capsys):
     out, report = str(dive_result.out), tmp_path / "m.json"
     known = np.linalg.norm(spots[0][0] - spots[0][1])
@@ -319,6 +325,15 @@ def test_command_line_wants_one_thing(dive_result, tmp_path):
     for arguments, words in (
         (["--from", "1"], "a measurements.yaml, or --from and --to"),
         ([str(file), "--to", "1"], "says what to measure: --from, --to"),
+        (["--from", "abc", "--to", "2"], r"^--from 'abc' is no pick: .*11\.9\)$"),
+        (["--from", "3", "--to", "3"], "both ends are the same point 3"),
+        (["--from", "3", "--to", "99999999"], "^--to: point 99999999: there is no"),
+        (["--from", "3", "--to", "4", "--known=-3"], "--known must be positive"),
+        (
+            ["--from", "3", "--to", "4", "--click-stddev=-1"],
+            "--click-stddev must be positive",
+        ),
+        (["--from", "3", "--to", "4", "-o", str(file)], "exists already"),
     ):
         with pytest.raises(InputError, match=words):
             CliRunner().invoke(

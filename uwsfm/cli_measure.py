@@ -1,11 +1,16 @@
 """`uwsfm measure`."""
 
+import math
+import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwsfm.errors import InputError
+
+if TYPE_CHECKING:
+    from uwsfm.measuring.picks import Pick
 
 _PICK = (
     "a point id (1234), a place of a cloud (0.1,-0.4,1.9), or pixels "
@@ -69,7 +74,10 @@ def measure(
         what = measurements
     else:
         what = _single(start, end, known, click_stddev)
-    found = run(out, what, report)
+    try:
+        found = run(out, what, report)
+    except InputError as error:
+        raise InputError(_as_typed(str(error), measurements)) from None
     console.print(measurement_table(found))
     for warning in found.warnings:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
@@ -85,10 +93,38 @@ def _single(
         raise InputError(
             "name what to measure: a measurements.yaml, or --from and --to"
         )
-    item: dict[str, Any] = {"name": "distance", "ends": [start, end]}
+    picks = [_pick("--from", start), _pick("--to", end)]
+    if picks[0] == picks[1]:
+        raise InputError(f"--from and --to: both ends are the same {picks[0]}")
+    for option, value in (("--known", known), ("--click-stddev", click_stddev)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise InputError(f"{option} must be positive, got {value:g}")
+    item: dict[str, Any] = {"name": "distance", "ends": picks}
     content: dict[str, Any] = {"version": 1}
     if click_stddev is not None:
         content["click_stddev_px"] = click_stddev
     if known is None:
         return {**content, "distances": [item]}
     return {**content, "scale_bars": [{**item, "length_m": known}]}
+
+
+def _pick(option: str, text: str) -> "Pick":
+    from uwsfm.measuring.picks import IN_YAML, parsed_pick
+
+    try:
+        return parsed_pick(text)
+    except ValueError as error:
+        raise InputError(f"{option} {str(error).removesuffix(IN_YAML)}") from None
+
+
+_KEY = re.compile(r"^(?:distances|scale_bars)\[0\](?:\.ends\[([01])\]| \(distance\))")
+
+
+def _as_typed(text: str, measurements: Path | None) -> str:
+    """A message with the options that were typed, where there is no file with keys."""
+    if measurements is not None:
+        return text
+    return _KEY.sub(
+        lambda found: ("--from", "--to")[int(found[1])] if found[1] else "--from, --to",
+        text,
+    )

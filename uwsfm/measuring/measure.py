@@ -13,6 +13,7 @@ import numpy as np
 from uwsfm.calibration.length_verdicts import ASK_FOR_LENGTH, scale_verdict
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.errors import InputError
+from uwsfm.export.files import checked_target
 from uwsfm.export.summary import versions, write_json
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.measuring import quantities
@@ -90,12 +91,14 @@ def measure(
         out: Folder of `reconstruct` or `refine_model`, or what `open_result` gives.
         measurements: A measurements.yaml, or its content; see
             `uwsfm.measuring.measurements_file`.
-        report: JSON file to write.
+        report: JSON file to write; must not exist.
 
     Raises:
-        InputError: the folder or the file is not usable, or a pick cannot be placed;
-            one sentence that names it.
+        InputError: there is a report already, the folder or the file is not usable, or
+            a pick cannot be placed; one sentence that names it.
     """
+    if report is not None:
+        checked_target(report)
     tasks = load_measurements(measurements)
     result = out if isinstance(out, Result) else open_result(out)
     propagation = Propagation(result.calibration)
@@ -256,6 +259,22 @@ def agreement(ratio: float) -> str:
     return "doubtful" if abs(ratio) <= CONTRADICTION else "contradicts"
 
 
+_WRONG_UNITS = {1e3: "millimetres", 1e2: "centimetres", 1e1: "decimetres"}
+_NEARLY = 1.5
+
+
+def unit_hint(known: float, measured: float) -> str | None:
+    """What a known length may have been given in, if not in metres."""
+    if not measured > 0.0:
+        return None
+    for factor, name in _WRONG_UNITS.items():
+        if 1.0 / _NEARLY < known / measured / factor < _NEARLY:
+            return f"{factor:g} times what was measured: {name}?"
+        if 1.0 / _NEARLY < measured / known / factor < _NEARLY:
+            return f"{factor:g} times too short: is it in metres?"
+    return None
+
+
 def _of_its_size(value: float, stddev: float) -> list[str]:
     if value > DOUBTFUL * stddev:
         return []
@@ -334,4 +353,5 @@ def bar_check(item: Measurement, arbitrary: bool) -> dict[str, Any]:
         "stddev_m": stddev,
         "ratio": deviation / stddev,
         "verdict": agreement(deviation / stddev),
+        "hint": unit_hint(task.length_m, item.value),
     }

@@ -29,8 +29,9 @@ _CLICK = re.compile(
 )
 _FORMS = (
     "write a point id (1234), a place (0.1,-0.4,1.9) or pixels "
-    "(left/01.png:412.5,300+right/01.png:380.1,311.9); in YAML between quotes"
+    "(left/01.png:412.5,300+right/01.png:380.1,311.9)"
 )
+IN_YAML = "; in YAML between quotes"
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def parsed_pick(value: Any) -> Pick:
         if len(value) == 3 and all(_is_number(item) for item in value):
             x, y, z = map(float, value)
             return WorldPick((x, y, z))
-    raise ValueError(f"{value!r} is no pick: {_FORMS}")
+    raise ValueError(f"{value!r} is no pick: {_FORMS}{IN_YAML}")
 
 
 def _is_number(value: Any) -> bool:
@@ -105,12 +106,12 @@ def _from_text(text: str) -> Pick:
     while at < len(text):
         found = _CLICK.match(text, at)
         if found is None:
-            raise ValueError(f"{text!r} is no pick: {_FORMS}")
+            raise ValueError(f"{text!r} is no pick: {_FORMS}{IN_YAML}")
         xy = [float(found["x"]), float(found["y"])]
         clicks.append(_click({"image": found["image"].strip(), "xy": xy}))
         at = found.end()
     if not clicks or text.endswith("+"):
-        raise ValueError(f"{text!r} is no pick: {_FORMS}")
+        raise ValueError(f"{text!r} is no pick: {_FORMS}{IN_YAML}")
     return _of_clicks(clicks)
 
 

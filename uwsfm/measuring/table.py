@@ -69,7 +69,8 @@ def _remarks(item: Measurement, arbitrary: bool) -> list[str]:
                 f", off by {1e3 * check['deviation_m']:+.3f} mm, "
                 f"{check['ratio']:+.1f} std. dev."
             )
-        found.append(f"{text}: {check['verdict']}")
+        hint = f" ({check['hint']})" if check.get("hint") else ""
+        found.append(f"{text}: {check['verdict']}{hint}")
     if item.flatness is not None and item.task.kind == "area":
         rms = math.sqrt(float((item.flatness**2).mean()))
         off = f"{rms:.2g}" if arbitrary else f"{1e3 * rms:.2g} mm"

@@ -156,7 +156,8 @@ def find_level(
     if above is None:
         raise InputError(
             "which side of the points is up is not known, for there are neither "
-            "cameras nor normals: say so with --up"
+            "cameras nor normals: say so with --up, or keep the file in its result "
+            "folder, whose cameras tell"
         )
     return level_by_plane(points, above)
 
