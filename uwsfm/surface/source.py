@@ -107,9 +107,12 @@ class Source:
         """What the user should know, one sentence each."""
         found = []
         if self.is_sparse:
+            assert self.folder is not None
+            dense = self.folder / DENSE_CLOUD
+            there = "there is" if dense.is_file() else "uwsfm dense makes"
             found.append(
                 f"{self.path} holds the points of the adjustment, far fewer than a "
-                f"dense cloud, and there is no {DENSE_CLOUD} (uwsfm dense)"
+                f"dense cloud, which {there} as {dense}"
             )
         if self.unit != "metre":
             found.append("the scale of this reconstruction is arbitrary: no metres")
