@@ -107,6 +107,11 @@ class _Reader:
             for frame in range(model.scene.num_frames)
             if model.has_image(camera, frame)
         ]
+        for path in self.paths():
+            if not path.is_file():
+                raise InputError(
+                    f"image {path} is missing: say with --images where it is"
+                )
         self._done: dict[str, int] = {}
 
     def paths(self) -> list[Path]:
