@@ -12,7 +12,7 @@ from typing import Any
 COMPILE = "from uwsfm.first_run import compile_kernels; print(compile_kernels(2))"
 IMPORT = "import uwsfm.cli, uwsfm.pipeline"
 ENTRY = "from uwsfm.cli import main; main()"
-LAST_STAGES = ("refractive adjustment", "colours and export")
+LAST_STAGES = ("refractive adjustment", "colours and export", "report")
 """Which every run does again; the ones before are kept between runs."""
 
 

@@ -210,5 +210,6 @@ def _demo(results: Results) -> str:
         "## `uwsfm demo`\n\nWarm, seconds on the wall with all cores "
         f"({found['cpu_s']:.0f} s of CPU); a second run in the same folder takes "
         f"{found['second_run_s']:.1f} s, of which {found['second_start_s']:.1f} s are "
-        "not its adjustment and export.\n\n" + table(["stage", "s", "share"], lines)
+        "not its adjustment, export and report.\n\n"
+        + table(["stage", "s", "share"], lines)
     )
