@@ -10,8 +10,8 @@ from uwsfm import CalibrateOptions
 from uwsfm.calibration.uncertainty import likelihood
 from uwsfm.models.port import NoPort
 from uwsfm.simulate import Perturbation, SurveySpec, perturbed, simulate_survey
+from uwsfm.solver import block_cholesky, nested_dissection, schur, threads
 from uwsfm.solver import elimination_tree as trees
-from uwsfm.solver import nested_dissection, schur, threads
 from uwsfm.solver import reduced_factor as factors
 from uwsfm.solver import reduction as reductions
 from uwsfm.solver.block_graph import build_graph
@@ -104,6 +104,24 @@ def test_every_way_leads_to_the_same_step(survey, monkeypatch):
             for step in steps[1:]:
                 error = np.linalg.norm(scale * (step - steps[0]))
                 assert error < tolerance * np.linalg.norm(scale * steps[0])
+
+
+def test_what_memory_held_before_does_not_matter(survey, monkeypatch):
+    take = block_cholesky._Pool.take
+
+    def poisoned(pool, size):
+        square = take(pool, size)
+        square[:] = np.nan
+        return square
+
+    monkeypatch.setattr(block_cholesky._Pool, "take", poisoned)
+    layout, priors = next(iter(problems(survey.truth)))
+    eqs = likelihood(layout, State.from_scene(survey.truth), priors)
+    found = [reduced_covariance(layout, eqs, analyse(layout, k)) for k in KINDS]
+    assert all(one.determined for one in found)
+    for one in found:  # a fraction of the largest; they are sums of the same numbers
+        error = np.abs(one.blocks - found[0].blocks).max()
+        assert error < 1e-6 * np.abs(found[0].blocks).max()
 
 
 def test_every_way_leads_to_the_same_covariance(survey):

@@ -192,7 +192,9 @@ class BlockCholesky:
                 updates[number] = after
             for update in given:
                 self._pool.give(update)
-        return bool(np.isfinite([np.sum(p.own[-1]) for p in self._panels]).all())
+        # The last pivot of a front, after which any other NaN comes; below the diagonal
+        # is what the pool's arrays held.
+        return bool(np.isfinite([p.own[-1, -1] for p in self._panels]).all())
 
     def solve_half(self, right: Array) -> Array:
         """L^-1 times columns (6 n, r) in the factor's order."""
