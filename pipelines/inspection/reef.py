@@ -9,12 +9,11 @@ import numpy as np
 from uwsfm.dense.depth_map import pixel_rows
 from uwsfm.geometry import rigid3
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.simulate.footprints import footprints
 from uwsfm.simulate.raycasting import RayScene
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rigs import known_cam_from_rig, sample_rig
-from uwsfm.simulate.sea_floor import SeaFloorOptions, build_sea_floor
-from uwsfm.simulate.sequence import SequenceSpec, reseeded
+from uwsfm.simulate.sea_floor import SeaFloorOptions
+from uwsfm.simulate.sequence import SequenceSpec, floor_in_view, reseeded
 from uwsfm.simulate.trajectories import rich_motion
 
 ASSUMED_PX = 0.3
@@ -42,14 +41,7 @@ def reef_spec() -> SequenceSpec:
 
 def floor_of(spec: SequenceSpec) -> RayScene:
     """The surfaces alone: coarse paint, the same shape."""
-    boxes = footprints(
-        spec.rig,
-        spec.rig_from_world,
-        half_depth=4.0 * spec.floor.relief.stddev,
-        max_range=spec.max_range,
-    )
-    low, high = boxes[..., 0, :].min(axis=(0, 1)), boxes[..., 1, :].max(axis=(0, 1))
-    return build_sea_floor(replace(spec.floor, texel=0.02), low, high)
+    return floor_in_view(replace(spec, floor=replace(spec.floor, texel=0.02)))
 
 
 @dataclass(frozen=True)

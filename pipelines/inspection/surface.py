@@ -22,12 +22,10 @@ from uwsfm.color.commands import correct_colors
 from uwsfm.color.encoding import light_of, values_of
 from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3
-from uwsfm.simulate.footprints import footprints
 from uwsfm.simulate.raycasting import import_open3d
 from uwsfm.simulate.rendering import SensorOptions, render_image
 from uwsfm.simulate.rigs import known_cam_from_rig
-from uwsfm.simulate.sea_floor import build_sea_floor
-from uwsfm.simulate.sequence import sample_spec
+from uwsfm.simulate.sequence import floor_in_view, sample_spec
 from uwsfm.surface.commands import clean_cloud, make_map, mesh_cloud
 
 matplotlib.use("Agg")
@@ -35,19 +33,6 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 SHOWN = 9  # frame of the left camera
 ERROR_MM = 5.0
-
-
-def true_floor():
-    """The floor of the sample, and its options."""
-    spec = sample_spec()
-    boxes = footprints(
-        spec.rig,
-        spec.rig_from_world,
-        half_depth=4.0 * spec.floor.relief.stddev,
-        max_range=spec.max_range,
-    )
-    low, high = boxes[..., 0, :].min(axis=(0, 1)), boxes[..., 1, :].max(axis=(0, 1))
-    return build_sea_floor(spec.floor, low, high), spec
 
 
 def run(out: Path, work: Path) -> dict[str, dict]:
@@ -212,7 +197,8 @@ def main() -> None:
     work.mkdir(parents=True)
     reports = run(arguments.out, work)
     model = uwsfm.read_model(arguments.out)
-    floor, spec = true_floor()
+    spec = sample_spec()
+    floor = floor_in_view(spec)
     print_water(reports["color"], spec)
     shown = compare_colors(model, work, floor, spec)
     errors = height_errors(model, work, floor, spec)

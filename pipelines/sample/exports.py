@@ -21,9 +21,7 @@ from uwsfm.export.image_depth import ImageDepth
 from uwsfm.export.pinhole import PinholeModel, pinhole_model, virtual_from_img
 from uwsfm.export.warp import read_image, warp_image, warp_maps
 from uwsfm.geometry import rigid3
-from uwsfm.simulate.footprints import footprints
-from uwsfm.simulate.sea_floor import build_sea_floor
-from uwsfm.simulate.sequence import sample_spec
+from uwsfm.simulate.sequence import floor_in_view, sample_spec
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -37,15 +35,8 @@ MAX_PX = 0.3
 def true_floor():
     """The mesh of the sample, roughly painted: only its shape matters here."""
     spec = sample_spec()
-    boxes = footprints(
-        spec.rig,
-        spec.rig_from_world,
-        half_depth=4.0 * spec.floor.relief.stddev,
-        max_range=spec.max_range,
-    )
-    low, high = boxes[..., 0, :].min(axis=(0, 1)), boxes[..., 1, :].max(axis=(0, 1))
-    shape = replace(spec.floor, texel=PAINT_M)
-    return build_sea_floor(shape, low, high), spec.rig_from_world[0]
+    shape = replace(spec, floor=replace(spec.floor, texel=PAINT_M))
+    return floor_in_view(shape), spec.rig_from_world[0]
 
 
 def errors_of(

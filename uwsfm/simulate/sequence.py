@@ -20,6 +20,7 @@ from uwsfm.models.port import DomePort, NoPort, Port
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate.footprints import footprints
+from uwsfm.simulate.raycasting import RayScene
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rendering import SensorOptions, WaterOptions, render_image
 from uwsfm.simulate.rigs import (
@@ -224,16 +225,25 @@ def truth_of(spec: SequenceSpec) -> dict[str, Any]:
     }
 
 
-def _render_images(spec: SequenceSpec, folder: Path, progress: Progress) -> None:
-    poses = np.asarray(spec.rig_from_world, dtype=np.float64)
-    half_depth = 4.0 * spec.floor.relief.stddev
-    boxes = footprints(spec.rig, poses, half_depth=half_depth, max_range=spec.max_range)
-    progress("sea floor", 0, None)
-    scene = build_sea_floor(
+def floor_in_view(spec: SequenceSpec) -> RayScene:
+    """The sea floor as far as the images of a sequence see it."""
+    boxes = footprints(
+        spec.rig,
+        np.asarray(spec.rig_from_world, dtype=np.float64),
+        half_depth=4.0 * spec.floor.relief.stddev,
+        max_range=spec.max_range,
+    )
+    return build_sea_floor(
         spec.floor,
         boxes[..., 0, :].min(axis=(0, 1)),
         boxes[..., 1, :].max(axis=(0, 1)),
     )
+
+
+def _render_images(spec: SequenceSpec, folder: Path, progress: Progress) -> None:
+    poses = np.asarray(spec.rig_from_world, dtype=np.float64)
+    progress("sea floor", 0, None)
+    scene = floor_in_view(spec)
     progress("sea floor", 1, 1)
     names = frame_names(len(poses))
     done, total = 0, len(poses) * len(spec.rig.cameras)
