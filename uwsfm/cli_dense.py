@@ -81,8 +81,9 @@ def _table(summary: dict[str, Any]) -> "Table":
     """What the cloud holds, and how well its points are known."""
     from rich.table import Table
 
-    metric = summary["unit"] == "metre"
-    small = "mm" if metric else "1e-3, scale arbitrary"
+    from uwsfm.surface.units import length_words
+
+    unit = summary["unit"]
     table = Table(title="Dense cloud", title_justify="left", show_header=False)
     maps = summary["depth_maps"]
     shares = [entry["share_matched"] for entry in maps]
@@ -94,14 +95,16 @@ def _table(summary: dict[str, Any]) -> "Table":
     table.add_row("contradicted", f"{summary['num_contradicted']}")
     table.add_row("seen by too few", f"{summary['num_unchecked']}")
     table.add_row("points", f"{summary['num_points']}")
-    table.add_row("voxel", f"{1e3 * summary['voxel']:.2g} {small}")
+    table.add_row("voxel", length_words(summary["voxel"], unit))
     table.add_row(
         "noise of a disparity", f"{summary['noise_px']:.2f} px, {summary['noise_from']}"
     )
     spread = summary["stddev_percentiles"]
     known = [v for v in summary["calibration_stddev_max"].values() if v is not None]
-    label = f"standard deviation along the sight, 5 50 95 % ({small})"
+    label = "standard deviation along the sight, 5 50 95 %"
     if not known:
         label += ", calibration not counted"
-    table.add_row(label, " ".join(f"{1e3 * value:.2g}" for value in spread.values()))
+    table.add_row(
+        label, ", ".join(length_words(value, unit) for value in spread.values())
+    )
     return table
