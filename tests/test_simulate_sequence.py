@@ -10,7 +10,7 @@ import pytest
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.rig_file import load_rig
+from uwsfm.rig_file import dump_rig, load_rig
 from uwsfm.simulate.commands import (
     TRAJECTORIES,
     simulate_images,
@@ -18,12 +18,14 @@ from uwsfm.simulate.commands import (
 )
 from uwsfm.simulate.observation_file import read_observations
 from uwsfm.simulate.rendering import SensorOptions
-from uwsfm.simulate.rigs import sample_rig
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.sea_floor import SeaFloorOptions
 from uwsfm.simulate.sequence import (
     SequenceSpec,
+    dome_spec,
     frame_names,
     render_sequence,
+    rig_header,
     sample_spec,
     truth_of,
 )
@@ -87,6 +89,23 @@ def test_rig_yaml_is_the_users_start_and_truth_json_the_truth(rendered):
     np.testing.assert_array_equal(
         list(truth["rig_from_world"].values()), TINY.rig_from_world
     )
+
+
+def test_the_head_of_a_rig_file_speaks_of_the_ports_that_it_has(tmp_path):
+    dump_rig(
+        nominal_rig(dome_spec().rig), tmp_path / "rig.yaml", rig_header(dome_spec().rig)
+    )
+    words = " ".join(_comments(tmp_path / "rig.yaml"))
+    assert "domes assumed centred on their cameras" in words
+    assert "straight" not in words and "distance" not in words
+    for camera in load_rig(tmp_path / "rig.yaml").cameras:
+        assert camera.port.center == (0.0, 0.0, 0.0)  # as it says
+    assert "\n".join(_comments(SAMPLE / "rig.yaml")) == rig_header(sample_spec().rig)
+
+
+def _comments(path: Path) -> list[str]:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [line[2:] for line in lines if line.startswith("# ")]
 
 
 def test_a_folder_in_use_is_never_written_to(tmp_path):

@@ -16,7 +16,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, NoPort, Port
+from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate.footprints import footprints
@@ -38,8 +38,12 @@ COASTAL_WATER = WaterOptions(
     veil=(0.02, 0.13, 0.22),
 )
 RIG_HEADER = """Simulated stereo rig, as one would write it down before a dive:
-lenses and camera placement calibrated in air, ports assumed straight and at half
-their true distance. The truth is in truth.json."""
+lenses and camera placement calibrated in air{}. The truth is in truth.json."""
+GUESSES = {
+    FlatPort: ", ports assumed straight and at half\ntheir true distance",
+    DomePort: ", domes assumed centred\non their cameras",
+}
+"""What `nominal_rig` makes of each kind of port, after the words before it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +156,7 @@ def render_sequence(
     """Render a sequence into a folder that does not exist yet, or is empty.
 
     Writes ``images/<camera>/0001.jpg`` and so on, ``rig.yaml`` (straight ports at half
-    the true distance), ``truth.json`` and ``SHA256SUMS``.
+    the true distance, concentric domes), ``truth.json`` and ``SHA256SUMS``.
 
     Raises:
         InputError: the folder is not empty, or the floor is too large.
@@ -163,10 +167,18 @@ def render_sequence(
         raise InputError(f"{out_dir}: exists and is not an empty folder")
     with replaced_dir(out_dir) as partial:
         _render_images(spec, partial / "images", progress)
-        dump_rig(nominal_rig(spec.rig), partial / "rig.yaml", RIG_HEADER)
+        dump_rig(nominal_rig(spec.rig), partial / "rig.yaml", rig_header(spec.rig))
         truth = json.dumps(truth_of(spec), indent=1)
         (partial / "truth.json").write_text(truth + "\n", encoding="utf-8")
         _write_checksums(partial)
+
+
+def rig_header(rig: Rig) -> str:
+    """What is said on top of rig.yaml of the kinds of port that are there."""
+    kinds = {type(camera.port) for camera in rig.cameras}
+    return RIG_HEADER.format(
+        "".join(GUESSES[kind] for kind in GUESSES if kind in kinds)
+    )
 
 
 def reseeded(spec: SequenceSpec, seed: int) -> SequenceSpec:
