@@ -201,3 +201,20 @@ def test_a_model_is_not_overwritten_by_its_own_refinement(dive, tmp_path):
 def test_options_that_do_nothing_are_refused(dive, plain, tmp_path):
     with pytest.raises(uwsfm.InputError, match="has no effect"):
         uwsfm.refine_model(plain, dive.rig, tmp_path / "out", focal_stddev=1e-3)
+
+
+@pytest.mark.parametrize("job", ["reconstruct", "refine_model", "calibrate_housing"])
+def test_the_distance_of_a_scene_is_not_asked_of_a_rig_with_a_baseline(
+    dive, plain, tmp_path, job
+):
+    """Also if it is the default, which the user of a stereo rig has no need to give."""
+    source = plain if job != "reconstruct" else tmp_path
+    inputs = (source, dive.rig) if job == "refine_model" else (dive.rig, source)
+    words = "scene_distance_m has no effect: the baseline of the rig gives the scale"
+    with pytest.raises(uwsfm.InputError, match=words):
+        getattr(uwsfm, job)(*inputs, tmp_path / "out", scene_distance_m=1.0)
+    assert not (tmp_path / "out").exists()
+    alone = replace(dive.rig, cameras=dive.rig.cameras[:1], baseline_m=None)
+    inputs = (source, alone) if job == "refine_model" else (alone, source)
+    with pytest.raises(uwsfm.InputError, match="scene_distance_m must be positive"):
+        getattr(uwsfm, job)(*inputs, tmp_path / "out", scene_distance_m=0.0)

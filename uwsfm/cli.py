@@ -145,7 +145,7 @@ def reconstruct(
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
-    scene_distance: SceneDistanceOption = 1.0,
+    scene_distance: SceneDistanceOption = None,
     also: RefineOption = None,
     prior: PriorOption = None,
     seed: Annotated[
@@ -239,7 +239,7 @@ def calibrate(
         Literal["colmap", "paper"],
         typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
     ] = "colmap",
-    scene_distance: SceneDistanceOption = 1.0,
+    scene_distance: SceneDistanceOption = None,
     seed: Annotated[
         int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
     ] = 0,
@@ -251,10 +251,7 @@ def calibrate(
     from uwsfm.sfm.options import MatchOptions, StartOptions
 
     front_end = StartOptions(
-        matching=MatchOptions(matcher=matcher),
-        scene_distance_m=scene_distance,
-        seed=seed,
-        num_threads=threads,
+        matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
     )
     with ProgressBars() as progress:
         result = calibrate_housing(
@@ -265,6 +262,7 @@ def calibrate(
             positions=positions,
             lever_arm=lever_arm_of(lever_arm),
             lengths=lengths,
+            scene_distance_m=scene_distance,
             front_end=front_end,
             progress=progress,
             strategy=strategy,
@@ -294,7 +292,7 @@ def refine(
         Path | None,
         typer.Option(help="COLMAP's database: more matches, frames that it lost."),
     ] = None,
-    scene_distance: SceneDistanceOption = 1.0,
+    scene_distance: SceneDistanceOption = None,
     also: RefineOption = None,
     prior: PriorOption = None,
     report: ReportOption = True,

@@ -42,9 +42,11 @@ MapperOption = Annotated[
     typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
 ]
 SceneDistanceOption = Annotated[
-    float,
+    float | None,
     typer.Option(
-        metavar="METRES", help="Of one camera's scene, about: no baseline tells."
+        metavar="METRES",
+        help="Of one camera's scene, about, as no baseline tells; default: 1.",
+        show_default=False,
     ),
 ]
 SchedulerOption = Annotated[

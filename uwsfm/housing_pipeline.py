@@ -34,6 +34,7 @@ from uwsfm.pipeline import (
     output_folder,
     refined_rig,
     require_effect,
+    scene_distance,
     start_scene,
 )
 from uwsfm.rig import Rig
@@ -75,6 +76,7 @@ def calibrate_housing(
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
+    scene_distance_m: float | None = None,
     progress: Progress = silent,
     **options: Any,
 ) -> HousingResult:
@@ -90,7 +92,7 @@ def calibrate_housing(
             "pairs": matches between the cameras of one frame only, with rig and
             distances as given (section 3.2.1). One frame alone is "pairs".
         front_end: how features are found and matched.
-        positions, lever_arm, lengths: as in `reconstruct`.
+        positions, lever_arm, lengths, scene_distance_m: as in `reconstruct`.
         progress: called with each long step.
         **options: fields of `CalibrateOptions`.
 
@@ -116,6 +118,9 @@ def calibrate_housing(
         )
     found = find_model(source)
     front_end = front_end or StartOptions()
+    if scene_distance_m is not None:
+        distance_m = scene_distance(rig, scene_distance_m)
+        front_end = replace(front_end, scene_distance_m=distance_m)
     job = _Job(rig, source, out, start, front_end, known, progress, merged)
     if found is None:
         frames = find_frames(source, rig, min_num_frames=1)

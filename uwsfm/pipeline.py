@@ -83,7 +83,7 @@ def reconstruct(
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
-    scene_distance_m: float = 1.0,
+    scene_distance_m: float | None = None,
     seed: int = 0,
     num_threads: int = -1,
     submap_frames: int | None = None,
@@ -114,7 +114,7 @@ def reconstruct(
             is in their frame.
         lever_arm: (3,) of the antenna they are of, in the rig, metres.
         lengths: YAML file of scale bars and distances between frames, see there.
-        scene_distance_m: Of a single camera, about; two or more measure it.
+        scene_distance_m: Of a single camera, about; None: 1. Two or more measure it.
         seed: Of all random choices.
         num_threads: -1 for all cores; as many processes map the parts of a survey.
         submap_frames: A survey of more frames is mapped in parts of at most so many,
@@ -140,7 +140,7 @@ def reconstruct(
         matching=MatchOptions(strategy=matching, matcher=matcher),
         mapping=MappingOptions(submap_frames=submap_frames),
         mapper=mapper,
-        scene_distance_m=scene_distance_m,
+        scene_distance_m=scene_distance(rig, scene_distance_m),
         seed=seed,
         num_threads=num_threads,
         scheduler=scheduler,
@@ -246,6 +246,24 @@ def checked_rig(rig: Rig | str | Path) -> Rig:
         except InputError as error:
             raise InputError(f"camera {camera.name!r}: {error}") from None
     return rig
+
+
+def scene_distance(rig: Rig, given_m: float | None) -> float:
+    """How far away the scene of a single camera is, about, metres; 1 if nobody knows.
+
+    Raises:
+        InputError: it is not positive, or the rig has a baseline, which tells.
+    """
+    if given_m is None:
+        return 1.0
+    if len(rig.cameras) > 1:
+        raise InputError(
+            "scene_distance_m has no effect: the baseline of the rig gives the scale; "
+            "leave this option out"
+        )
+    if not 0.0 < given_m < np.inf:
+        raise InputError(f"scene_distance_m must be positive, got {given_m}")
+    return given_m
 
 
 def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:

@@ -38,6 +38,7 @@ from uwsfm.pipeline import (
     output_folder,
     refined_rig,
     require_effect,
+    scene_distance,
 )
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
@@ -89,7 +90,7 @@ def refine_model(
     *,
     images: str | Path | None = None,
     database: str | Path | None = None,
-    scene_distance_m: float = 1.0,
+    scene_distance_m: float | None = None,
     positions: str | Path | None = None,
     lever_arm: ArrayLike | None = None,
     lengths: str | Path | None = None,
@@ -117,7 +118,7 @@ def refine_model(
         database: COLMAP's database of the model: tracks are made again from all its
             matches, and frames that the model lacks are registered. It is not changed.
         scene_distance_m: Of a single camera's scene, about: without a baseline it sets
-            the scale to start with.
+            the scale to start with; None: 1.
         positions, lever_arm, lengths, report: As in `reconstruct`.
         progress: Called with each long step.
         **options: Fields of `CalibrateOptions`.
@@ -131,8 +132,7 @@ def refine_model(
     rig = checked_rig(rig)
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
-    if not 0.0 < scene_distance_m < np.inf:
-        raise InputError(f"scene_distance_m must be positive, got {scene_distance_m}")
+    distance_m = scene_distance(rig, scene_distance_m)
     source, out = Path(source), output_folder(out)
     found = _found(source)
     if out.exists() and _same_or_inside(found.folder, out / SPARSE):
@@ -141,7 +141,7 @@ def refine_model(
             "would replace: choose another folder"
         )
     clock = time.perf_counter()
-    start = start_from_model(found, rig, scene_distance_m)
+    start = start_from_model(found, rig, distance_m)
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images, rig, start)
