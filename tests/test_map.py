@@ -9,10 +9,11 @@ import pytest
 from sfm_scenes import model_of, simulated_dive
 from typer.testing import CliRunner
 
+from uwsfm._ply import read_vertices, write_ply
 from uwsfm.cli import app
-from uwsfm.cloud import Cloud, write_cloud
+from uwsfm.cloud import UNKNOWN_UNIT, Cloud, write_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import export_colmap, export_ply
+from uwsfm.export.files import export_colmap, export_ply, unit_of_model
 from uwsfm.export.housing import export_housing
 from uwsfm.geometry import rigid3
 from uwsfm.simulate.relief import Relief
@@ -20,6 +21,7 @@ from uwsfm.simulate.rigs import sample_rig
 from uwsfm.surface.commands import make_map
 from uwsfm.surface.height_map import make_height_map
 from uwsfm.surface.level import UPS, find_level, fit_plane, level_by_axis, rotation_of
+from uwsfm.surface.source import find_source
 
 tifffile = pytest.importorskip("tifffile")
 
@@ -109,6 +111,22 @@ def test_a_relief_comes_back_level_at_its_place_with_its_hole(tmp_path: Path, rn
     )
     picture = cv2.imread(str(tmp_path / "map" / "map.png"))
     assert picture.shape[0] > 400 and picture.std() > 20
+
+
+def test_a_unit_that_nothing_tells_is_never_a_metre(tmp_path: Path, rng):
+    """As of a result without summary.json, saved by another program."""
+    out = tmp_path / "out"
+    (out / "sparse").mkdir(parents=True)
+    write_cloud(floor_cloud(rng), tmp_path / "cloud.ply")
+    table, _ = read_vertices(tmp_path / "cloud.ply")
+    write_ply(out / "points.ply", [("vertex", table)], comment="of another program")
+    assert unit_of_model(out) == UNKNOWN_UNIT == find_source(out).unit
+    (out / "points.ply").rename(tmp_path / "points.ply")
+    said = run("map", tmp_path / "points.ply", "-o", tmp_path / "map")
+    assert "(unknown unit)" in said and "nothing tells the unit" in said
+    with tifffile.TiffFile(tmp_path / "map" / "height.tif") as file:
+        tags = {tag.code: tag.value for tag in file.pages[0].tags}
+    assert 3076 not in tags[34735] and UNKNOWN_UNIT in tags[34737]  # no linear unit
 
 
 def test_axes_of_the_world_become_right_handed_maps():

@@ -232,8 +232,9 @@ def _print_water(report: dict[str, Any]) -> None:
     from rich.table import Table
 
     from uwsfm.console import console
+    from uwsfm.surface.units import short_unit
 
-    short = "m" if report["unit"] == "metre" else "arbitrary unit"
+    short = short_unit(report["unit"])
     table = Table(title="Water: ± is one standard deviation", title_justify="left")
     table.add_column("channel")
     rows = {

@@ -21,6 +21,8 @@ _COLUMNS = (
     ("view_range", "<f4"),
 )
 _UNIT = "unit: "
+UNKNOWN_UNIT = "unknown unit"
+"""Of lengths that nobody tells the unit of."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +114,7 @@ def read_cloud(path: str | Path) -> Cloud:
 
 
 def unit_of_cloud(path: str | Path) -> str:
-    """What the lengths of a cloud file are in, by its comment; "metre" without one.
+    """What the lengths of a cloud file are in, by its comment; `UNKNOWN_UNIT` without.
 
     Raises:
         InputError: the file is not there, or no such PLY.
@@ -121,4 +123,4 @@ def unit_of_cloud(path: str | Path) -> str:
     for comment in comments:
         if comment.startswith(_UNIT):
             return comment[len(_UNIT) :].split(";")[0]
-    return "metre"
+    return UNKNOWN_UNIT

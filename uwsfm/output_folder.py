@@ -1,6 +1,5 @@
 """The output folder of a run: never over what others made, one run at a time."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +8,7 @@ from filelock import FileLock, Timeout
 
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import CALIBRATION
-from uwsfm.export.files import HOUSING, POINTS, SPARSE, SUMMARY, WORK
+from uwsfm.export.files import HOUSING, POINTS, SPARSE, SUMMARY, WORK, read_summary
 from uwsfm.report.files import FOLDER, PAGE
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
@@ -38,10 +37,10 @@ def _made_by_us(out: Path) -> bool:
     if (out / WORK / STEPS_FILE).exists() or (out / WORK / LOCK).exists():
         return True
     try:
-        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
-        return "uwsfm" in summary["versions"]
-    except (OSError, ValueError, KeyError, TypeError):
+        versions = (read_summary(out) or {}).get("versions")
+    except InputError:
         return False
+    return isinstance(versions, dict) and "uwsfm" in versions
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from uwsfm.export.calibration_file import (
     read_calibration,
     write_calibration,
 )
-from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model
+from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model, read_summary
 
 DENSE_CLOUD = "dense/cloud.ply"
 """Where `uwsfm dense` leaves its cloud."""
@@ -71,18 +71,12 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
             damaged, the files are of different runs, or ``images`` lacks an image.
     """
     folder = Path(out)
-    summary_path = folder / SUMMARY
     model = read_model(folder)
-    try:
-        summary = json.loads(summary_path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    summary = read_summary(folder)
+    if summary is None:
         raise InputError(
-            f"{summary_path} is missing: the run has not finished; {RUN_AGAIN}"
-        ) from None
-    except (OSError, ValueError):
-        summary = None
-    if not isinstance(summary, dict):
-        raise InputError(f"{summary_path} is damaged: {RUN_AGAIN}")
+            f"{folder / SUMMARY} is missing: the run has not finished; {RUN_AGAIN}"
+        )
     mark = fingerprint(folder / SPARSE, folder / HOUSING)
     calibration = read_calibration(folder / CALIBRATION, model.scene, mark)
     return Result(

@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm._files import replaced_dir, require_writable
 from uwsfm._ply import write_ply
+from uwsfm.cloud import UNKNOWN_UNIT
 from uwsfm.colmap import (
     Model,
     from_reconstruction,
@@ -15,6 +17,7 @@ from uwsfm.colmap import (
     to_reconstruction,
 )
 from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import RUN_AGAIN
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig_file import load_rig
@@ -55,13 +58,32 @@ def checked_target(path: str | Path) -> Path:
     return target
 
 
-def unit_of_model(folder: str | Path) -> str:
-    """What the lengths of a result are in, by its summary; "metre" without one."""
+def read_summary(folder: str | Path) -> dict[str, Any] | None:
+    """summary.json of a result folder; None if there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    path = Path(folder) / SUMMARY
     try:
-        text = (Path(folder) / SUMMARY).read_text(encoding="utf-8")
-        return str(json.loads(text)["scale"]["unit"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "metre"
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError):
+        summary = None
+    if not isinstance(summary, dict):
+        raise InputError(f"{path} is damaged: {RUN_AGAIN}")
+    return summary
+
+
+def unit_of_model(folder: str | Path) -> str:
+    """What the lengths of a result are in, by its summary; `UNKNOWN_UNIT` without.
+
+    Raises:
+        InputError: the summary is damaged.
+    """
+    summary = read_summary(folder) or {}
+    return summary.get("scale", {}).get("unit", UNKNOWN_UNIT)
 
 
 def export_colmap(model: Model, folder: str | Path) -> None:

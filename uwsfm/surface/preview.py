@@ -7,6 +7,7 @@ import numpy as np
 from uwsfm._files import replaced_file
 from uwsfm.surface.height_map import HeightMap
 from uwsfm.surface.packages import import_package
+from uwsfm.surface.units import short_unit
 
 _MAX_SIDE = 1600  # pixels of the map that are drawn
 _HEIGHT_IN, _DPI = 5.0, 130
@@ -46,7 +47,7 @@ def write_preview(found: HeightMap, path: Path, title: str, unit: str) -> None:
         height, extent=extent, norm=norm, cmap="viridis", interpolation="nearest"
     )
     right.imshow(shade, extent=extent, cmap="gray", alpha=0.35, vmin=0.0, vmax=1.0)
-    short = "m" if unit == "metre" else "arbitrary unit"
+    short = short_unit(unit)
     figure.colorbar(drawn, ax=right, label=f"height, {short}", shrink=0.9)
     for axes, name in ((left, "orthophoto"), (right, "height")):
         axes.set_title(name, size=9)

@@ -1,16 +1,20 @@
 """The cloud that is meant by a result folder or by a file."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from uwsfm._ply import read_vertices
-from uwsfm.cloud import Cloud, read_cloud, unit_of_cloud
+from uwsfm.cloud import UNKNOWN_UNIT, Cloud, read_cloud, unit_of_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import POINTS, SPARSE, SUMMARY, read_model, unit_of_model
+from uwsfm.export.files import (
+    POINTS,
+    SPARSE,
+    read_model,
+    read_summary,
+    unit_of_model,
+)
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.result_folder import DENSE_CLOUD, find_dense_cloud
@@ -32,10 +36,10 @@ class Source:
 
     @property
     def unit(self) -> str:
-        """Of its lengths: "metre", or "scale arbitrary"."""
-        if self.folder is not None:
-            return unit_of_model(self.folder)
-        return unit_of_cloud(self.path)
+        """Of its lengths: "metre", "scale arbitrary", what another program's file
+        says, or `UNKNOWN_UNIT`."""
+        known = UNKNOWN_UNIT if self.folder is None else unit_of_model(self.folder)
+        return unit_of_cloud(self.path) if known == UNKNOWN_UNIT else known
 
     def table(self) -> np.ndarray:
         """All columns of its vertices, a structured array (N,)."""
@@ -85,7 +89,7 @@ class Source:
             InputError: which way is up would be a guess.
         """
         has_positions = self.folder is not None and (
-            read_summary(self.folder).get("positions") is not None
+            (read_summary(self.folder) or {}).get("positions") is not None
         )
         above = self.above(cloud)
         return find_level(up, cloud.points, above, has_positions=has_positions)
@@ -114,24 +118,12 @@ class Source:
                 f"{self.path} holds the points of the adjustment, far fewer than a "
                 f"dense cloud, which {there} as {dense}"
             )
-        if self.unit != "metre":
+        unit = self.unit
+        if unit == UNKNOWN_UNIT:
+            found.append(f"nothing tells the unit of {self.path}: no metres")
+        elif unit != "metre":
             found.append("the scale of this reconstruction is arbitrary: no metres")
         return found
-
-
-def read_summary(folder: Path) -> dict[str, Any]:
-    """summary.json of a result folder; empty if there is none.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    path = folder / SUMMARY
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError):
-        raise InputError(f"{path} is damaged") from None
 
 
 def find_source(path: str | Path) -> Source:
