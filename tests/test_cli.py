@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from filelock import FileLock
 from sfm_scenes import model_of
 
@@ -252,6 +253,26 @@ def test_export_writes_what_is_asked(tmp_path, to):
         assert load_rig(tmp_path / "back.yaml").cameras[0].port == rig.cameras[0].port
     again = run("export", "out", "-o", "target", "--to", to, cwd=tmp_path)
     _one_sentence(again, "target exists already")
+
+
+def test_init_says_of_which_cameras_a_model_has_no_port(tmp_path):
+    """Stock COLMAP's has none; its lens was calibrated in the water, or was not."""
+    lens, port = "PINHOLE 800 600 790 790 400 300", "FLATPORT 0 0 1 0.02 0.01 1 1.5 1.3"
+    for name, line in (("stock", lens), ("refractive", f"{lens} {port}")):
+        (tmp_path / "cameras.txt").write_text(f"7 {line}\n")
+        found = run("init", f"{name}.yaml", "--from", "cameras.txt", cwd=tmp_path)
+        assert found.returncode == 0, found.stderr
+        comments = (tmp_path / f"{name}.yaml").read_text().replace("\n#", "")
+        for text in (found.stdout, comments):
+            words = " ".join(text.split())
+            told = "o port was found of camera7: their lenses may have been calib"
+            assert (told in words) == (name == "stock")
+    # A port that is put there refracts, though the file was made without one.
+    data = yaml.safe_load((tmp_path / "stock.yaml").read_text())
+    assert data["water"] == {"refractive_index": 1.333}
+    (tmp_path / "cameras.txt").rename(tmp_path / "cameras.bin")
+    found = run("init", "again.yaml", "--from", ".", cwd=tmp_path)
+    _one_sentence(found, "cameras.txt: no such file, only cameras.bin: ports are in")
 
 
 @pytest.mark.parametrize(

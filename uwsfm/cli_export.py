@@ -1,5 +1,6 @@
 """What goes to other programs, and what comes from them."""
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -84,14 +85,22 @@ def _export_pinhole(model: "Model", out: Path, images: Path | None) -> None:
 
 def init_from(source: Path, rig_file: Path) -> None:
     """`uwsfm init --from`."""
+    from rich.markup import escape
+
+    from uwsfm.console import console
     from uwsfm.rig_file import dump_rig
-    from uwsfm.sfm.refractive_colmap import rig_of_refractive_colmap
+    from uwsfm.sfm.refractive_colmap import ports_missing, rig_of_refractive_colmap
 
     rig = rig_of_refractive_colmap(source)
-    header = "The rig of a model of Refractive COLMAP."
+    missing = ports_missing(rig)
+    header = "The rig of a COLMAP model."
     if rig.baseline_m is not None:
         header += "\nThe cameras' placement is in the unit of that model: check it."
+    if missing:
+        header += "\n" + textwrap.fill(missing[0].upper() + missing[1:] + ".", 86)
     dump_rig(rig, rig_file, header)
     length = "" if rig.baseline_m is None else f", baseline {rig.baseline_m:g} m"
     folders = ", ".join(camera.images for camera in rig.cameras)
     typer.echo(f"wrote {rig_file}: image folders {folders}{length}; check them")
+    if missing:
+        console.print(f"[yellow]note:[/yellow] {escape(missing)}")

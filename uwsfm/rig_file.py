@@ -33,6 +33,8 @@ from uwsfm.rig_schema import (
 )
 from uwsfm.rig_values import ARBITRARY_SCALE, checked_baseline
 
+FRESH_WATER = 1.333
+
 # ---- Reading ------------------------------------------------------------------------
 
 
@@ -340,9 +342,10 @@ def _block(rig: Rig, i: int) -> dict[str, Any]:
 
 
 def _common_water(rig: Rig) -> float:
-    """The water index of the first port; of a rig without one, any."""
+    """The water index of the first port; of a rig without one, that of water, for the
+    port that somebody may put there."""
     indices = [c.port.n_water for c in rig.cameras if not isinstance(c.port, NoPort)]
-    return indices[0] if indices else 1.0
+    return indices[0] if indices else FRESH_WATER
 
 
 def _port_block(camera: RigCamera, n_water: float) -> dict[str, Any]:

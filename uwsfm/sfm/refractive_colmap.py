@@ -67,7 +67,13 @@ def read_refractive_cameras(path: str | Path) -> dict[int, PortCamera]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        hint = ""
+        if path.with_suffix(".bin").is_file():
+            hint = (
+                f", only {path.stem}.bin: ports are in text models (colmap "
+                "model_converter --output_type TXT writes one)"
+            )
+        raise InputError(f"{path}: no such file{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     found: dict[int, PortCamera] = {}
@@ -180,6 +186,20 @@ def rig_of_refractive_colmap(path: str | Path) -> Rig:
         cameras=tuple(_rig_camera(cameras[i], folders[i]) for i in ids),
         cam_from_rig=np.array(poses),
         baseline_m=float(np.linalg.norm(poses[1][4:])) if len(ids) > 1 else None,
+    )
+
+
+def ports_missing(rig: Rig) -> str:
+    """What to do about cameras that a model has no port of, a sentence; "": there are
+    none. Stock COLMAP's have none, and lenses that make up for refraction."""
+    bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
+    if not bare:
+        return ""
+    return (
+        f"no port was found of {', '.join(bare)}: their lenses may have been "
+        "calibrated under water, and then hold the refraction already and take no "
+        "port; to work with ports, put intrinsics calibrated in air, the port and the "
+        "water index in their place (uwsfm init without --from explains each)"
     )
 
 
