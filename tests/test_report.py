@@ -226,29 +226,40 @@ def test_what_other_commands_left_is_named(dive_result, tmp_path):
     assert '<a href="my%20reef.glb">my reef.glb</a>' in page_of(report)
 
 
-def test_the_dense_cloud_is_told_with_its_numbers_or_as_another_model_s(
+def test_what_was_made_is_told_with_its_numbers_or_as_another_model_s(
     dive_result, tmp_path
 ):
+    pytest.importorskip("tifffile")
     out = tmp_path / "out"
     shutil.copytree(dive_result.out, out)
-    (out / "dense").mkdir(exist_ok=True)
-    (out / "dense" / "cloud.ply").write_bytes(b"")
+    uwsfm.make_map(out, out / "map", up="z")
+    uwsfm.clean_cloud(out, out / "good.ply")
+    content = {"version": 1, "distances": [{"ends": [1, 2]}]}
+    uwsfm.measure(out, content, out / "measured.json")
     dense = {
-        "model": uwsfm.open_result(out).fingerprint,
         "num_points": 1234,
         "stddev_percentiles": {"5": 2e-4, "50": 4e-4, "95": 8e-4},
         "noise_px": 0.1,
         "noise_from": "differences between depth maps",
         "depth_maps": [{"share_matched": 0.7}, {"share_matched": 0.9}],
     }
-    for model, words in (
-        (dense["model"], "1234 points; standard deviation along the sight 0.2, 0.4, "),
-        ("f" * 64, "of another model: run uwsfm dense again"),
-    ):
-        text = json.dumps({**dense, "model": model})
-        (out / "dense" / "summary.json").write_text(text)
-        told = dict(left_files(out, "report", "mm", 1e3))["dense/cloud.ply"]
-        assert words in told
+    (out / "dense").mkdir()
+    (out / "dense" / "cloud.ply").write_bytes(b"")
+    text = json.dumps({**dense, "model": uwsfm.open_result(out).fingerprint})
+    (out / "dense" / "summary.json").write_text(text)
+    told = dict(left_files(out, "report", "mm", 1e3))
+    assert "1234 points; standard deviation along the sight 0.2, 0.4, " in told.pop(
+        "dense/cloud.ply"
+    )
+    assert told["map/height.tif"].startswith("map: ")
+    assert told["measured.json"] == "measurements: 1, of these 1 determined"
+    with (out / "housing.yaml").open("a") as file:
+        file.write("# another\n")
+    told = dict(left_files(out, "report", "mm", 1e3))
+    assert len(told) == 5  # with ortho.tif and good.ply
+    assert all("but of another model: make it again" in what for what in told.values())
+    with pytest.raises(InputError, match=r"good\.ply is of another model"):
+        uwsfm.make_map(out / "good.ply", tmp_path / "again", up="z")
 
 
 def test_view_tells_where_the_page_is(dive_result, tmp_path):

@@ -1,6 +1,7 @@
 """The folder that `uwsfm reconstruct`, `refine` and `demo` leave, read again."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model, read_summar
 
 DENSE_CLOUD = "dense/cloud.ply"
 """Where `uwsfm dense` leaves its cloud."""
+MAP, MESH, WATER = "map.json", "mesh.json", "water.json"
+"""What `uwsfm map`, `mesh` and `color` tell of the files they write beside it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +80,7 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
         raise InputError(
             f"{folder / SUMMARY} is missing: the run has not finished; {RUN_AGAIN}"
         )
-    mark = fingerprint(folder / SPARSE, folder / HOUSING)
+    mark = fingerprint_of(folder)
     calibration = read_calibration(folder / CALIBRATION, model.scene, mark)
     return Result(
         folder=folder,
@@ -98,19 +101,57 @@ def find_dense_cloud(folder: Path) -> Path | None:
     cloud = folder / DENSE_CLOUD
     if not cloud.is_file():
         return None
-    try:
-        summary = json.loads((cloud.parent / SUMMARY).read_text(encoding="utf-8"))
-        mark = summary["model"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return cloud  # it names no model, so that it was put there by hand
-    if mark != fingerprint(folder / SPARSE, folder / HOUSING):
-        raise InputError(f"{cloud} is of another model: run uwsfm dense again")
+    require_model(cloud, folder, "run uwsfm dense again")
     return cloud
+
+
+def fingerprint_of(folder: Path) -> str:
+    """Of the model and the housing of a result folder, as they are now.
+
+    Raises:
+        InputError: one of them is missing.
+    """
+    return fingerprint(folder / SPARSE, folder / HOUSING)
+
+
+def told_of(path: Path) -> Mapping[str, Any]:
+    """What the JSON file beside a cloud, a mesh or a map tells of it: that of the same
+    name, or else the one of its folder; empty for what was put there by hand."""
+    names = (path.with_suffix(".json").name, MAP, MESH, WATER, SUMMARY)
+    there = [path.with_name(name) for name in names if path.with_name(name).is_file()]
+    return read_told(there[0]) if there else {}
+
+
+def read_told(path: Path) -> Mapping[str, Any]:
+    """What a JSON file that uwsfm wrote holds; empty if it is another's, or damaged."""
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def require_model(path: Path, folder: Path, advice: str) -> None:
+    """See to it that a file was made of the model that a result folder has now.
+
+    What names no model was put there by hand, and passes.
+
+    Args:
+        path: a cloud, a mesh or a map.
+        folder: of the result.
+        advice: what to do if not, for the message.
+
+    Raises:
+        InputError: it names another model.
+    """
+    mark = told_of(path).get("model")
+    if mark is not None and mark != fingerprint_of(folder):
+        raise InputError(f"{path} is of another model: {advice}")
 
 
 def store_calibration(calibration: CalibrationResult, out: Path) -> None:
     """Write calibration.npz beside the model and the housing that are there."""
-    mark = fingerprint(out / SPARSE, out / HOUSING)
+    mark = fingerprint_of(out)
     write_calibration(calibration, out / CALIBRATION, mark)
 
 

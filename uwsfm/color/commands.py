@@ -25,9 +25,8 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import POINTS, checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.export.warp import read_image, write_image
-from uwsfm.result_folder import Result, find_dense_cloud, open_result
+from uwsfm.result_folder import WATER, Result, find_dense_cloud, open_result
 
-WATER = "water.json"
 STATED = "colours without the water, by uwsfm color"
 
 
@@ -72,6 +71,7 @@ def correct_colors(
     problem = water.problem()
     report: dict[str, Any] = {
         "source": str(out),
+        "model": result.fingerprint,
         "unit": result.unit,
         "encoding": encoding,
         "num_lost_samples": samples.num_lost,

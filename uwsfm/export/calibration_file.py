@@ -53,9 +53,11 @@ def fingerprint(sparse: Path, housing: Path) -> str:
     """SHA-256 over the files of a COLMAP model and its housing, names included.
 
     Raises:
-        InputError: one cannot be read.
+        InputError: one cannot be read, or there is no such model.
     """
     digest = hashlib.sha256()
+    if not sparse.is_dir():
+        raise InputError(f"{sparse}: no such COLMAP model folder")
     files = sorted(path for path in sparse.iterdir() if path.is_file())
     for path in [*files, housing]:
         digest.update(path.name.encode() + b"\0")

@@ -290,6 +290,7 @@ def _summary(
     arbitrary = result.calibration.covariance.scale_stddev is None
     return {
         "result": str(result.folder.absolute()),
+        "model": result.fingerprint,
         "unit": result.unit,
         "stddev": STDDEV,
         "measurements": [entry(item, arbitrary) for item in items],

@@ -1,13 +1,13 @@
 """What other commands left in an output folder, and what they say of it."""
 
-import json
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from uwsfm.errors import InputError
-from uwsfm.export.files import POINTS, SPARSE, SUMMARY, WORK
-from uwsfm.result_folder import DENSE_CLOUD, find_dense_cloud
+from uwsfm.export.files import POINTS, SPARSE, WORK
+from uwsfm.result_folder import DENSE_CLOUD, fingerprint_of, read_told, told_of
 
 _KINDS = {
     ".ply": "cloud or mesh",
@@ -31,14 +31,17 @@ def left_files(
         small_unit: of small lengths.
         small_scale: how many of it a unit of the model is.
     """
-    scale = small_scale, small_unit
+    folder = _Folder(out, small_unit, small_scale)
     own_names = {SPARSE, POINTS, own, WORK}
     found = [
-        (path, _words(path, out, scale))
+        (path, folder.words(path, told_of(path)))
         for path in sorted([*out.glob("*.*"), *out.glob("*/*.*")])
         if path.suffix in _KINDS and path.is_file()
     ]
-    found += [(path, _measured_words(path)) for path in sorted(out.glob(_MEASURED))]
+    found += [
+        (path, folder.words(path, read_told(path)))
+        for path in sorted(out.glob(_MEASURED))
+    ]
     places = [(path.relative_to(out), what) for path, what in found]
     return tuple(
         (path.as_posix(), what)
@@ -47,59 +50,63 @@ def left_files(
     )
 
 
-def _words(path: Path, out: Path, scale: tuple[float, str]) -> str:
-    if path == out / DENSE_CLOUD:
-        return _dense_words(out, scale)
-    kind = _KINDS[path.suffix]
-    try:
-        if path.suffix == ".tif":
-            found = _read(path.with_name("map.json"))
-            cell = _small(found["resolution"], scale)
-            size = f"{found['num_columns']} x {found['num_rows']}"
-            share = f"{found['share_with_data']:.0%} with data"
-            return f"map: {size} cells of {cell}, {share}, {found['level']}"
-        if path.stem in ("mesh", "web"):
-            found = _read(path.with_name("mesh.json"))
-            count = found[path.stem]["num_triangles"]
-            far = _small(found["max_distance"], scale)
-            return f"mesh: {count} triangles, none further than {far} from a point"
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # it was put there by hand
-    return kind
+@dataclass(frozen=True)
+class _Folder:
+    """An output folder, and the small lengths of its model."""
 
+    out: Path
+    small_unit: str
+    small_scale: float
 
-def _dense_words(out: Path, scale: tuple[float, str]) -> str:
-    try:
-        find_dense_cloud(out)
-    except InputError:
-        return "a dense cloud, but of another model: run uwsfm dense again"
-    try:
-        found = _read((out / DENSE_CLOUD).with_name(SUMMARY))
-        spread = [found["stddev_percentiles"][share] for share in ("5", "50", "95")]
-        matched = [entry["share_matched"] for entry in found["depth_maps"]]
+    @cached_property
+    def fingerprint(self) -> str:
+        return fingerprint_of(self.out)
+
+    def words(self, path: Path, told: Mapping[str, Any]) -> str:
+        """What a file is, by what is told of it."""
+        is_dense, mark = path == self.out / DENSE_CLOUD, told.get("model")
+        kind = "dense cloud" if is_dense else _KINDS.get(path.suffix, "measurements")
+        if mark is not None and mark != self.fingerprint:
+            return f"{kind}, but of another model: make it again"
+        try:
+            if is_dense:
+                return self._dense(told)
+            if path.suffix == ".tif":
+                return self._map(told)
+            if path.suffix == ".json":
+                return _measured(told)
+            return self._mesh(told[path.stem], told["max_distance"])
+        except (ValueError, KeyError, TypeError, ZeroDivisionError):
+            return kind  # it was put there by hand
+
+    def _dense(self, told: Mapping[str, Any]) -> str:
+        spread = [told["stddev_percentiles"][share] for share in ("5", "50", "95")]
+        spread = [f"{self.small_scale * value:.2g}" for value in spread]
+        matched = [entry["share_matched"] for entry in told["depth_maps"]]
         return (
-            f"dense cloud: {found['num_points']} points; standard deviation along the "
-            f"sight {', '.join(f'{scale[0] * x:.2g}' for x in spread)} {scale[1]} "
-            f"(5, 50, 95 %); noise of a disparity {found['noise_px']:.2f} px "
-            f"({found['noise_from']}); {sum(matched) / len(matched):.0%} of the pixels "
+            f"dense cloud: {told['num_points']} points; standard deviation along the "
+            f"sight {', '.join(spread)} {self.small_unit} "
+            f"(5, 50, 95 %); noise of a disparity {told['noise_px']:.2f} px "
+            f"({told['noise_from']}); {sum(matched) / len(matched):.0%} of the pixels "
             "have a depth"
         )
-    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
-        return "cloud, without a summary of uwsfm dense"
+
+    def _map(self, told: Mapping[str, Any]) -> str:
+        size = f"{told['num_columns']} x {told['num_rows']}"
+        cell, share = self._small(told["resolution"]), told["share_with_data"]
+        return f"map: {size} cells of {cell}, {share:.0%} with data, {told['level']}"
+
+    def _mesh(self, told: Mapping[str, Any], distance: float) -> str:
+        return (
+            f"mesh: {told['num_triangles']} triangles, none further than "
+            f"{self._small(distance)} from a point"
+        )
+
+    def _small(self, value: float) -> str:
+        return f"{self.small_scale * value:.2g} {self.small_unit}"
 
 
-def _measured_words(path: Path) -> str:
-    try:
-        items = _read(path)["measurements"]
-        determined = sum(item["value"] is not None for item in items)
-    except (OSError, ValueError, KeyError, TypeError):
-        return "measurements"
+def _measured(told: Mapping[str, Any]) -> str:
+    items = told["measurements"]
+    determined = sum(item["value"] is not None for item in items)
     return f"measurements: {len(items)}, of these {determined} determined"
-
-
-def _small(value: float, scale: tuple[float, str]) -> str:
-    return f"{scale[0] * value:.2g} {scale[1]}"
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))

@@ -15,6 +15,7 @@ from uwsfm.export.files import checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.result_folder import MAP, MESH
 from uwsfm.surface.clean import clean_points, default_options
 from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
 from uwsfm.surface.height_map import make_height_map
@@ -71,6 +72,7 @@ def clean_cloud(
         )
     report = {
         "source": str(found.path),
+        "model": found.model,
         "unit": found.unit,
         "num_points": len(table),
         "num_kept": int(np.count_nonzero(keep)),
@@ -140,6 +142,7 @@ def mesh_cloud(
     small = decimated(mesh, web_triangles, cloud)
     report: dict[str, Any] = {
         "source": str(found.path),
+        "model": found.model,
         "unit": found.unit,
         "method": method,
         "num_points": len(cloud),
@@ -160,7 +163,7 @@ def mesh_cloud(
         write_obj(mesh, partial / "mesh.obj", found.unit)
         write_glb(mesh, partial / "mesh.glb", level, found.unit)
         write_glb(small, partial / "web.glb", level, found.unit)
-        write_json(report, partial / "mesh.json")
+        write_json(report, partial / MESH)
     return report
 
 
@@ -202,6 +205,7 @@ def make_map(
     pose = world_from_map(level)
     report = {
         "source": str(found.path),
+        "model": found.model,
         "unit": found.unit,
         "level": level.method,
         "relief_about_plane": level.relief,
@@ -226,7 +230,7 @@ def make_map(
         write_height_tiff(grid, partial / "height.tif", frame, found.unit)
         write_color_tiff(grid, partial / "ortho.tif", frame, found.unit)
         write_preview(grid, partial / "map.png", title, found.unit)
-        write_json(report, partial / "map.json")
+        write_json(report, partial / MAP)
     return report
 
 

@@ -17,7 +17,13 @@ from uwsfm.export.files import (
 )
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import DENSE_CLOUD, find_dense_cloud
+from uwsfm.result_folder import (
+    DENSE_CLOUD,
+    find_dense_cloud,
+    fingerprint_of,
+    require_model,
+    told_of,
+)
 from uwsfm.surface.level import Level, find_level
 
 
@@ -40,6 +46,13 @@ class Source:
         says, or `UNKNOWN_UNIT`."""
         known = UNKNOWN_UNIT if self.folder is None else unit_of_model(self.folder)
         return unit_of_cloud(self.path) if known == UNKNOWN_UNIT else known
+
+    @property
+    def model(self) -> str | None:
+        """Fingerprint of the model that it was made of; None if nothing tells."""
+        if self.folder is None:
+            return told_of(self.path).get("model")
+        return fingerprint_of(self.folder)
 
     def table(self) -> np.ndarray:
         """All columns of its vertices, a structured array (N,)."""
@@ -130,12 +143,14 @@ def find_source(path: str | Path) -> Source:
     """The dense cloud of a result folder, or its points if there is none; or a file.
 
     Raises:
-        InputError: neither is there, or the dense cloud is of another model.
+        InputError: neither is there, or the cloud is of another model than the
+            result folder that it is in.
     """
     path = Path(path)
     if path.is_file():
         for folder in (path.parent, path.parent.parent):
             if (folder / SPARSE).is_dir() and (folder / POINTS).is_file():
+                require_model(path, folder, f"make it again of {folder}")
                 return Source(path=path, folder=folder)
         return Source(path=path, folder=None)
     if not path.is_dir():
