@@ -19,10 +19,10 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 @pytest.fixture(scope="session")
 def open3d() -> ModuleType:
     """Open3D; where it cannot be imported, the test is skipped with the reason."""
-    from uwsfm.simulate.raycasting import import_open3d
+    from uwsfm._packages import import_package
 
     try:
-        return import_open3d()
+        return import_package("open3d", "this test", "render")
     except MissingPackageError as error:
         pytest.skip(str(error))
 

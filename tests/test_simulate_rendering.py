@@ -1,14 +1,12 @@
 """Rendered images are exact: things appear where the projection says they do."""
 
-import sys
-
 import cv2
 import numpy as np
 import pytest
 
-from uwsfm.errors import InputError, MissingPackageError
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.simulate.raycasting import RayScene, Surface, import_open3d
+from uwsfm.simulate.raycasting import RayScene, Surface
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rendering import SensorOptions, WaterOptions, render_image
 from uwsfm.simulate.rigs import sample_rig
@@ -204,9 +202,3 @@ def test_a_texture_too_large_for_opencv_is_refused():
 def test_options_out_of_range_are_refused(build, name):
     with pytest.raises(InputError, match=name):
         build()
-
-
-def test_without_open3d_the_error_names_the_package_and_its_libraries(monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)  # what a failed import leaves
-    with pytest.raises(MissingPackageError, match=r"open3d.*libusb-1\.0-0.*libgl1"):
-        import_open3d()

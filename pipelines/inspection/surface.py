@@ -5,7 +5,7 @@
 
 The sample is rendered, so its floor, its water and its colours are known. Prints the
 tables of README.md and draws color.png and surface.png; files go to WORK. Needs
-'uwsfm[render,inspect,figures]'.
+'uwsfm[render,inspect]'.
 """
 
 import argparse
@@ -18,11 +18,11 @@ import numpy as np
 import tifffile
 
 import uwsfm
+from uwsfm._packages import import_package
 from uwsfm.color.commands import correct_colors
 from uwsfm.color.encoding import light_of, values_of
 from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3
-from uwsfm.simulate.raycasting import import_open3d
 from uwsfm.simulate.rendering import SensorOptions, render_image
 from uwsfm.simulate.rigs import known_cam_from_rig
 from uwsfm.simulate.sequence import floor_in_view, sample_spec
@@ -121,7 +121,7 @@ def height_errors(model: uwsfm.Model, work: Path, floor, spec) -> np.ndarray:
 
 def view_of_mesh(work: Path, size=(900, 560)) -> np.ndarray:
     """The web copy from one side, by casting rays."""
-    open3d = import_open3d()
+    open3d = import_package("open3d", "a picture of the mesh", "render")
     mesh = open3d.io.read_triangle_mesh(str(work / "mesh" / "web.glb"))
     vertices = np.asarray(mesh.vertices)  # glTF: y up
     scene = open3d.t.geometry.RaycastingScene()

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._files import replaced_file
+from uwsfm._packages import import_package
 from uwsfm.colmap import Model
-from uwsfm.errors import MissingPackageError
 from uwsfm.export.scene_ply import camera_lines
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -51,7 +51,7 @@ def write_recording(out: str | Path, images: str | Path | None = None) -> Path:
         InputError: the folder is not such a one, or cannot be written to.
         MissingPackageError: Rerun is not installed.
     """
-    rerun = import_rerun()
+    rerun = import_package("rerun", "a recording", "rerun")
     result = open_result(out, images)
     stream = rerun.RecordingStream("uwsfm", recording_id=result.folder.resolve().name)
     path = result.folder / RECORDING
@@ -66,22 +66,6 @@ def write_recording(out: str | Path, images: str | Path | None = None) -> Path:
         stream.flush()
         stream.disconnect()
     return path
-
-
-def import_rerun() -> ModuleType:
-    """Rerun's SDK.
-
-    Raises:
-        MissingPackageError: it is not installed.
-    """
-    try:
-        import rerun
-    except ImportError as error:
-        raise MissingPackageError(
-            "recordings for Rerun need the package rerun-sdk (pip install "
-            f"'uwsfm[rerun]'), but importing it failed: {error}"
-        ) from error
-    return rerun
 
 
 def show_recording(path: Path) -> bool:

@@ -1,35 +1,13 @@
 """Textured triangle meshes, and what rays hit of them (Open3D)."""
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.errors import MissingPackageError
+from uwsfm._packages import import_package
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.texture import Texture
-
-
-def import_open3d(purpose: str = "rendering", extra: str = "render") -> ModuleType:
-    """Open3D, imported when it is needed only.
-
-    Args:
-        purpose: what needs it, as the start of a sentence.
-        extra: of this package that installs it.
-
-    Raises:
-        MissingPackageError: the package or one of its system libraries is missing.
-    """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise MissingPackageError(
-            f"{purpose} needs the package open3d (pip install 'uwsfm[{extra}]') and "
-            "the system libraries libusb-1.0-0, libgomp1, libgl1, libegl1 and "
-            f"libx11-6, but importing it failed: {error}"
-        ) from error
-    return open3d
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +54,7 @@ class RayScene:
     """
 
     def __init__(self, surfaces: tuple[Surface, ...]) -> None:
-        self._open3d = import_open3d()
+        self._open3d = import_package("open3d", "rendering", "render")
         self.surfaces = surfaces
         self._scene = self._open3d.t.geometry.RaycastingScene()
         for surface in surfaces:

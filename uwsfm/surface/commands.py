@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm._files import replaced_dir
+from uwsfm._packages import import_package
 from uwsfm._ply import write_ply
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
@@ -23,7 +24,6 @@ from uwsfm.surface.las import write_las
 from uwsfm.surface.level import world_from_map
 from uwsfm.surface.mesh import decimated, distances_to_cloud, make_mesh
 from uwsfm.surface.mesh_files import write_glb, write_mesh_ply, write_obj
-from uwsfm.surface.packages import import_package
 from uwsfm.surface.preview import write_preview
 from uwsfm.surface.source import find_source
 from uwsfm.surface.units import length_words
@@ -192,11 +192,10 @@ def make_map(
 
     Raises:
         InputError: nothing to read, something to write over, or up is not known.
-        MissingPackageError: tifffile or matplotlib is missing.
+        MissingPackageError: tifffile is missing.
     """
     target = checked_target(folder)
-    for package in ("tifffile", "matplotlib"):
-        import_package(package, "uwsfm map")
+    import_package("tifffile", "uwsfm map", "inspect")
     found = find_source(source)
     cloud = found.cloud()
     level = found.level(cloud, up)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from uwsfm._files import replaced_file
+from uwsfm._packages import import_package
 from uwsfm.surface.height_map import HeightMap
-from uwsfm.surface.packages import import_package
 
 # Tags and keys of the GeoTIFF standard (OGC 19-008r4), and GDAL's for missing data.
 _PIXEL_SCALE, _TIEPOINT, _KEYS, _ASCII, _NO_DATA = 33550, 33922, 34735, 34737, 42113
@@ -45,7 +45,7 @@ def _write(
     unit: str,
     kind: dict[str, Any],
 ) -> None:
-    tifffile = import_package("tifffile", "writing GeoTIFF")
+    tifffile = import_package("tifffile", "writing GeoTIFF", "inspect")
     citation = f"{frame}, unit: {unit}|".encode("ascii", "replace").decode()
     keys = [
         (_MODEL_TYPE, 0, 1, _USER_DEFINED),

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from uwsfm._files import replaced_file
+from uwsfm._packages import import_package
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.surface.packages import import_package
 
 MAX_SCALE = 1e-4
 """Metres per step of the stored integers: positions are rounded by half of it."""
@@ -39,9 +39,9 @@ def write_las(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
     target = Path(path)
     if target.suffix.lower() not in (".las", ".laz"):
         raise InputError(f"{target}: the name must end in .las or .laz")
-    laspy = import_package("laspy", "writing LAS")
+    laspy = import_package("laspy", "writing LAS", "inspect")
     if target.suffix.lower() == ".laz":
-        import_package("lazrs", "writing LAZ")
+        import_package("lazrs", "writing LAZ", "inspect")
     good = np.isfinite(cloud.points).all(axis=1)
     if not np.any(good):
         raise InputError(f"{target}: the cloud has no point with a finite position")

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from uwsfm._packages import import_package
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.simulate.raycasting import import_open3d
 from uwsfm.surface.height_map import point_spacing
 
 METHODS = ("poisson", "ball-pivoting")
@@ -69,7 +69,7 @@ def make_mesh(
         raise InputError(f"--method {method}: is one of {', '.join(METHODS)}")
     if max_distance is not None and not max_distance > 0.0:
         raise InputError(f"--max-distance must be positive, got {max_distance}")
-    open3d = import_open3d("a mesh", "inspect")
+    open3d = import_package("open3d", "a mesh", "inspect")
     cloud = cloud.select(np.isfinite(cloud.points).all(axis=1))
     if len(cloud) < _MIN_POINTS:
         raise UwsfmError(f"a mesh needs more than {len(cloud)} points")
@@ -107,7 +107,7 @@ def decimated(mesh: Mesh, num_triangles: int, cloud: Cloud) -> Mesh:
     """
     if len(mesh.triangles) <= num_triangles:
         return mesh
-    open3d = import_open3d("a mesh", "inspect")
+    open3d = import_package("open3d", "a mesh", "inspect")
     middle = mesh.vertices.mean(axis=0)
     raw = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices - middle),

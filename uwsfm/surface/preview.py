@@ -6,7 +6,6 @@ import numpy as np
 
 from uwsfm._files import replaced_file
 from uwsfm.surface.height_map import HeightMap
-from uwsfm.surface.packages import import_package
 from uwsfm.surface.units import short_unit
 
 _MAX_SIDE = 1600  # pixels of the map that are drawn
@@ -21,12 +20,10 @@ def write_preview(found: HeightMap, path: Path, title: str, unit: str) -> None:
         path: the PNG file.
         title: above both.
         unit: of lengths.
-
-    Raises:
-        MissingPackageError: matplotlib is missing.
     """
-    figures = import_package("matplotlib.figure", "drawing a preview")
-    colors = import_package("matplotlib.colors", "drawing a preview")
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
     step = max(1, -(-max(found.height.shape) // _MAX_SIDE))
     height, rgba = found.height[::step, ::step], found.colors[::step, ::step]
     rows, columns = found.height.shape
@@ -34,15 +31,13 @@ def write_preview(found: HeightMap, path: Path, title: str, unit: str) -> None:
     south = found.north - rows * found.resolution
     extent = (found.west, east, south, found.north)
     width_in = float(np.clip(_HEIGHT_IN * columns / rows, 3.0, 9.0))
-    figure = figures.Figure(
-        (2 * width_in + 2.2, _HEIGHT_IN + 0.8), layout="constrained"
-    )
+    figure = Figure((2 * width_in + 2.2, _HEIGHT_IN + 0.8), layout="constrained")
     figure.suptitle(title, size=10)
     left, right = figure.subplots(1, 2, sharey=True)
     left.imshow(rgba, extent=extent, interpolation="nearest")
     low, high = np.nanpercentile(height, [1.0, 99.0])
     shade = _hillshade(height, found.resolution * step)
-    norm = colors.Normalize(low, max(high, low + 1e-9))
+    norm = Normalize(low, max(high, low + 1e-9))
     drawn = right.imshow(
         height, extent=extent, norm=norm, cmap="viridis", interpolation="nearest"
     )
@@ -84,8 +79,9 @@ def _scale_bar(axes, extent: tuple[float, float, float, float], unit: str) -> No
 
 
 def _rectangle(x: float, y: float, width: float, height: float, color: str):
-    patches = import_package("matplotlib.patches", "drawing a preview")
-    return patches.Rectangle(
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(
         (x, y), width, height, facecolor=color, edgecolor="black", linewidth=0.6
     )
 

@@ -1,0 +1,31 @@
+"""What is not installed is named, a package or a library of the system."""
+
+from pathlib import Path
+
+import pytest
+
+from uwsfm._packages import import_package
+from uwsfm.errors import MissingPackageError
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        (None, "a test needs the package strange: pip install 'uwsfm[inspect]'"),
+        ("import of_strange", "a test needs the package of_strange: pip install "),
+        (
+            "import ctypes; ctypes.CDLL('libstrange.so.1')",  # as Open3D loads its own
+            "a test needs the system library libstrange.so.1 for package strange",
+        ),
+        ("raise ImportError('too old')", "package strange, but importing it failed: "),
+    ],
+)
+def test_what_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source, sentence: str
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    if source is not None:
+        (tmp_path / "strange.py").write_text(source)
+    with pytest.raises(MissingPackageError) as caught:
+        import_package("strange", "a test", "inspect")
+    assert sentence in str(caught.value)
