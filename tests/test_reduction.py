@@ -8,9 +8,16 @@ import pytest
 
 from uwsfm import CalibrateOptions
 from uwsfm.calibration.uncertainty import likelihood
+from uwsfm.geometry import rigid3
 from uwsfm.models.port import NoPort
 from uwsfm.simulate import Perturbation, SurveySpec, perturbed, simulate_survey
-from uwsfm.solver import block_cholesky, nested_dissection, schur, threads
+from uwsfm.solver import (
+    block_cholesky,
+    nested_dissection,
+    reduced_steps,
+    schur,
+    threads,
+)
 from uwsfm.solver import elimination_tree as trees
 from uwsfm.solver import reduced_factor as factors
 from uwsfm.solver import reduction as reductions
@@ -22,6 +29,8 @@ from uwsfm.solver.levenberg_marquardt import (
     Priors,
     minimize,
 )
+from uwsfm.solver.quasidefinite import symmetric
+from uwsfm.solver.reduced_steps import TOLERANCE, StepSolver
 from uwsfm.solver.reduction import BANDED, DENSE, SPARSE, analyse
 from uwsfm.solver.state import State
 from uwsfm.solver.terms import LengthTerm, PositionTerm, centers
@@ -99,11 +108,63 @@ def test_every_way_leads_to_the_same_step(survey, monkeypatch):
                 reduction = analyse(layout, kind)
                 system = schur.reduced_system(layout, reduction.graph, eqs, damping)
                 matrix = factors.dense_matrix(reduction, system)
-                steps.append(factors.solve(reduction, system, layout.num_lengths))
+                solver = StepSolver(reduction, layout.num_lengths)
+                steps.append(solver.step(system))
             scale = np.sqrt(np.abs(np.diag(matrix)))  # each unknown's own unit
             for step in steps[1:]:
                 error = np.linalg.norm(scale * (step - steps[0]))
                 assert error < tolerance * np.linalg.norm(scale * steps[0])
+
+
+def test_a_factor_serves_the_systems_that_are_near_it(survey, monkeypatch):
+    """Where that is worth it: here for surveys that are too small."""
+    monkeypatch.setattr(reduced_steps, "_most_solutions", lambda *_: 4)
+    truth = survey.truth
+    layout = layout_of(truth)
+    turns = np.random.default_rng(0).normal(scale=1e-4, size=(truth.num_frames, 6))
+    moved = rigid3.perturb(truth.rig_from_world, turns)
+    near = replace(truth, rig_from_world=moved)
+    far = perturbed(truth, Perturbation(rotation_stddev_deg=3.0))
+    reduction = analyse(layout, SPARSE)
+    made = []
+    factorize = reduction.factor.factorize
+    monkeypatch.setattr(
+        reduction.factor, "factorize", lambda b: made.append(1) or factorize(b)
+    )
+    solver = StepSolver(reduction, 0)
+    factors_made, errors = [], []
+    for scene, damping in (
+        (truth, 1e-4),
+        (near, 3e-5),
+        (far, 1e-8),
+        (far, 2e-8),
+    ):
+        eqs = likelihood(layout, State.from_scene(scene), None)
+        system = schur.reduced_system(layout, reduction.graph, eqs, damping)
+        step = solver.step(system)
+        matrix = symmetric(factors.dense_matrix(reduction, system))
+        exact = np.linalg.solve(matrix, factors.right_side(system))
+        miss = step - exact
+        errors.append(np.sqrt((miss @ matrix @ miss) / (exact @ matrix @ exact)))
+        factors_made.append(len(made))
+    assert factors_made == [1, 1, 2, 2]
+    # The estimate is in the norm of the old factor, which differs by a few tens of %.
+    assert max(errors) < 2.0 * TOLERANCE
+    assert max(errors[0], errors[2]) < 1e-8  # rounding, by condition numbers of 1e8
+    assert min(errors[1], errors[3]) > 1e-8  # else the test shows nothing
+    system.blocks[:] *= -1.0
+    assert solver.step(system) is None
+    assert len(made) == 3
+
+
+def test_lengths_get_factors_of_their_own(survey):
+    """They make the system indefinite."""
+    layout = layout_of(survey.truth, navigation=True, num_lengths=3)
+    reduction = analyse(layout, SPARSE)
+    assert reduced_steps._most_solutions(reduction, 3) == 0
+    costly = replace(reduction, tree=replace(reduction.tree, cost=1e12))
+    assert reduced_steps._most_solutions(costly, 3) == 0
+    assert reduced_steps._most_solutions(costly, 0) > 0
 
 
 def test_what_memory_held_before_does_not_matter(survey, monkeypatch):

@@ -24,7 +24,7 @@ from uwsfm.solver.normal_equations import (
     squared_errors,
     total_cost,
 )
-from uwsfm.solver.reduced_factor import solve
+from uwsfm.solver.reduced_steps import StepSolver
 from uwsfm.solver.reduction import DENSE, Reduction, analyse
 from uwsfm.solver.schur import ReducedSystem
 from uwsfm.solver.state import State
@@ -131,6 +131,10 @@ class Problem:
         """How the reduced systems are solved."""
         return analyse(self.layout)
 
+    @cached_property
+    def _solver(self) -> StepSolver:
+        return StepSolver(self.reduction, self.layout.num_lengths)
+
     def cost(self, state: State) -> tuple[float, int]:
         """Robust cost, priors included, and the number of valid errors."""
         cost, valid = total_cost(
@@ -164,7 +168,7 @@ class Problem:
         self._system = system = schur.reduced_system(
             self.layout, self.reduction.graph, eqs, damping, self._system
         )
-        step = solve(self.reduction, system, self.layout.num_lengths)
+        step = self._solver.step(system)
         if step is None:
             return None
         points_step = schur.substitute_back(

@@ -1,4 +1,4 @@
-"""Factors of reduced systems: steps, and what an inverse tells, whatever the structure.
+"""Factors of reduced systems, and what an inverse tells, whatever the structure.
 
 The border (rig, ports, position of the navigation's frame, known lengths) is dense. Of
 a banded or sparse system [[A, C], [C^T, D]] it is eliminated last:
@@ -80,23 +80,6 @@ def _collect(graph, matrix, blocks):
             for a in range(6):
                 for b in range(6):
                     blocks[slot, b, a] = matrix[6 * i + a, 6 * j + b]
-
-
-def solve(
-    reduction: Reduction, system: ReducedSystem, num_lengths: int
-) -> Array | None:
-    """Step (n,) of frames and border; None if the system is singular.
-
-    Args:
-        reduction: its structure.
-        system: damped.
-        num_lengths: how many of its last columns are lengths.
-    """
-    if reduction.kind == DENSE:
-        matrix = dense_matrix(reduction, system)
-        return solve_lower(matrix, right_side(system), num_lengths)
-    bordered = Bordered.of(reduction, system, num_lengths)
-    return None if bordered is None else bordered.step(right_side(system)[:, None])
 
 
 def inverse(
