@@ -19,6 +19,7 @@ from uwsfm import (
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import budget_summary, housing_summary
+from uwsfm.pipeline import housing_warnings
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import (
@@ -99,6 +100,8 @@ def test_what_is_said_of_a_dome(tmp_path):
     assert np.linalg.norm(rows["dome radius +1 mm"][1]["center_m"]) > 1e-4
     assert rows["water index +0.01"][2]["center_m"] == [0.0, 0.0, 0.0]
     assert verdicts(result, ["a", "b", "c"]) == ()
+    (told,) = housing_warnings(rig, result)
+    assert f"has no port of {rig.cameras[2].name}: lenses without one were" in told
 
     path = tmp_path / "housing.yaml"
     export_housing(rig, path, result)

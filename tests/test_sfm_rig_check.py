@@ -11,7 +11,7 @@ from sfm_scenes import same_frame_matches, simulated_dive
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import DomePort
+from uwsfm.models.port import DomePort, NoPort
 from uwsfm.rig import Rig
 from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
@@ -46,7 +46,7 @@ def turned(rig: Rig, poses: np.ndarray, pair: PairMatches) -> RigRotation:
 def refusal(rig: Rig, poses: np.ndarray, pair: PairMatches) -> str:
     with pytest.raises(InputError) as error:
         check_rig(rig, poses, [pair])
-        check_rotation(rig, turned(rig, poses, pair), [pair])
+        check_rotation(rig, poses, turned(rig, poses, pair), [pair])
     text = str(error.value)
     assert "'right'" in text
     assert "\n" not in text
@@ -73,7 +73,7 @@ def test_a_right_rig_passes_though_its_domes_are_off_their_centres():
     pair = same_frame_matches(simulated_dive(rig).scene)
     check_rig(known, poses_of(known), [pair])
     rotation = turned(known, poses_of(known), pair)
-    check_rotation(known, rotation, [pair])
+    check_rotation(known, poses_of(known), rotation, [pair])
     assert rotation.turn_deg.max() > MAX_TURN_DEG  # what a flat port would not pass
 
 
@@ -120,6 +120,44 @@ def test_equal_lenses_leave_several_explanations():
     text = refusal(given, poses_of(given), swapped)
     assert "swapped" in text
     assert "inverted" in text
+
+
+@pytest.mark.parametrize(
+    ("which", "names"),
+    [((0,), "'left'"), ((1,), "'right'"), ((0, 1), "'left' and 'right'")],
+)
+def test_a_lens_in_air_whose_port_is_missing_is_told(which, names):
+    """Of one lens its refraction looks like a turn of some 30 degrees; of both it
+    cancels, unless they are toed in: here by 15 degrees, seen as 11."""
+    lenses = tuple(item.camera for item in sample_rig().cameras)
+    toed_in = stereo_rig(lenses, right_rotvec_deg=(0.0, -15.0, 0.0))
+    given = nominal_rig(toed_in)
+    text = refusal(
+        without_ports(given, which),
+        poses_of(given),
+        same_frame_matches(simulated_dive(toed_in).scene),
+    )
+    assert f"probably the port of {names} is missing in the rig file" in text
+
+
+@pytest.mark.parametrize("angle_deg", [8.0, 30.0, 90.0])
+def test_a_wrong_rotation_of_lenses_calibrated_in_the_water_is_no_missing_port(
+    rig, angle_deg
+):
+    in_water = without_ports(rig, (0, 1))
+    pair = same_frame_matches(simulated_dive(in_water).scene)
+    poses = poses_of(rig)
+    poses[1] = rigid3.perturb(poses[1], np.radians([angle_deg, 0, 0, 0, 0, 0]))
+    text = refusal(in_water, poses, pair)
+    assert "cam_from_rig" in text and "missing" not in text
+
+
+def without_ports(rig: Rig, which: tuple[int, ...]) -> Rig:
+    cameras = list(rig.cameras)
+    for c in which:
+        bare = {"port": NoPort(), "refine_normal": False, "refine_distance": False}
+        cameras[c] = replace(cameras[c], **bare)
+    return replace(rig, cameras=tuple(cameras))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

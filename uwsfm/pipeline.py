@@ -32,6 +32,7 @@ from uwsfm.export.summary import (
 )
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
+from uwsfm.models.port import NoPort
 from uwsfm.output_folder import WORK, locked, output_folder
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
@@ -351,6 +352,13 @@ def _images_without_points(model: Model) -> list[str]:
 def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
     """What the images do not tell about the housings, one sentence each."""
     warnings = list(verdicts(calibration, [camera.name for camera in rig.cameras]))
+    bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
+    if bare:
+        warnings.append(
+            f"the rig file has no port of {', '.join(bare)}: lenses without one were "
+            "taken as calibrated in the water; one that was calibrated in air needs "
+            "its port there"
+        )
     if calibration.options.error_name == "point_3d":
         warnings.append(
             "the error in space is far more sensitive to noise than the reprojection "

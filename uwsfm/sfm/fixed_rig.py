@@ -59,7 +59,7 @@ def fix_rig(
         check_rig(rig, poses, pairs)
     rotation = correct_rotations(cameras, poses, pairs)
     if len(cameras) > 1:
-        check_rotation(rig, rotation, pairs)
+        check_rotation(rig, poses, rotation, pairs)
         depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
     else:
         depths = scene_distance_m * np.array([NEAR_TO_FAR])

@@ -277,7 +277,7 @@ def _checked_start(
     if enough:
         check_rig(rig, poses, matches)
         rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
-        check_rotation(rig, rotation, matches)
+        check_rotation(rig, poses, rotation, matches)
         notes = rotation.warnings(rig)
         if rig.refine_cam_from_rig:
             poses = rotation.cam_from_rig

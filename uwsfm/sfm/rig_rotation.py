@@ -58,7 +58,7 @@ def _cause(port: Port) -> str:
         return "its port is tilted by about four times that"
     if isinstance(port, DomePort):
         return "its dome is off its centre"
-    return "its lens looks elsewhere"
+    return "its lens was calibrated in air and its port is missing in the rig file"
 
 
 def correct_rotations(

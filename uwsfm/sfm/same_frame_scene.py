@@ -74,7 +74,7 @@ def same_frame_scene(rig: Rig, frames: Frames, database_path: Path) -> Scene:
     check_rig(rig, rig.cam_from_rig, pairs)
     cameras = rig.refractive_cameras()
     rotation = correct_rotations(cameras, rig.cam_from_rig, pairs)
-    check_rotation(rig, rotation, pairs)
+    check_rotation(rig, rig.cam_from_rig, rotation, pairs)
     good = []
     for pair in pairs:
         if len(pair) < MIN_RIG_MATCHES:
