@@ -29,3 +29,14 @@ def test_what_is_missing_is_named(
     with pytest.raises(MissingPackageError) as caught:
         import_package("strange", "a test", "inspect")
     assert sentence in str(caught.value)
+
+
+def test_an_interrupted_import_is_no_missing_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What pybind11 makes of Ctrl-C while a module is loaded."""
+    monkeypatch.syspath_prepend(tmp_path)
+    source = "raise ImportError('initialization failed') from KeyboardInterrupt()"
+    (tmp_path / "interrupted.py").write_text(source)
+    with pytest.raises(KeyboardInterrupt):
+        import_package("interrupted", "a test", "inspect")

@@ -64,9 +64,11 @@ def replaced_dir(path: Path) -> Iterator[Path]:
     os.chmod(partial, 0o755)
     try:
         yield partial
-        if path.exists():
-            shutil.rmtree(path)
-        os.replace(partial, path)
+        # What it replaces may take long to remove, and is needed until then.
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=PARTIAL) as old:
+            if path.exists():
+                os.replace(path, Path(old) / path.name)
+            os.replace(partial, path)
     finally:
         if partial.exists():
             shutil.rmtree(partial)

@@ -27,6 +27,8 @@ def import_package(name: str, purpose: str, extra: str) -> ModuleType:
     try:
         return import_module(name)
     except (ImportError, OSError) as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11 wraps it
+            raise error.__cause__ from None
         package = _DISTRIBUTIONS.get(name, name)
         library = _NO_LIBRARY.search(str(error))
         if library is not None:

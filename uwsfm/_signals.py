@@ -1,10 +1,16 @@
-"""SIGTERM ends a run as Ctrl-C does, but for the exit code."""
+"""SIGTERM ends a command as Ctrl-C does, but for the exit code: in one sentence."""
 
 import signal
+import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 EXIT_CODE = 128 + signal.SIGTERM
+
+RESUMES = "the same command resumes the run"
+NOTHING_WRITTEN = "nothing was written"
 
 
 class Terminated(KeyboardInterrupt):
@@ -15,11 +21,10 @@ received = threading.Event()
 
 
 def raise_on_sigterm() -> None:
-    """Turn SIGTERM into an exception of the main thread.
+    """Turn SIGTERM into an exception of the main thread."""
+    import numpy  # noqa: F401  before pycolmap, see uwsfm._load_order
+    import pycolmap  # noqa: F401  whose handler, glog's, would print the stack
 
-    To be called after pycolmap was imported: that installs a handler of glog's, which
-    prints the stack of the process.
-    """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
 
@@ -29,3 +34,19 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     signal.signal(number, signal.SIG_IGN)
     received.set()
     raise Terminated
+
+
+def tell_interrupted(left: str) -> None:
+    """The sentence: what an interrupted command leaves."""
+    print(f"interrupted; {left}", file=sys.stderr)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Around a command that writes all at its end or nothing; a decorator as well."""
+    raise_on_sigterm()
+    try:
+        yield
+    except KeyboardInterrupt:
+        tell_interrupted(NOTHING_WRITTEN)
+        raise

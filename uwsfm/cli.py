@@ -169,9 +169,10 @@ def reconstruct(
     Run the same command again to resume a run that was stopped.
     """
     from uwsfm.console import ProgressBars
-    from uwsfm.pipeline import reconstruct as run
 
     with ProgressBars() as progress:
+        from uwsfm.pipeline import reconstruct as run
+
         result = run(
             rig,
             images,
@@ -247,13 +248,14 @@ def calibrate(
 ) -> None:
     """Calibrate the ports only: housing.yaml, and what the images tell of it."""
     from uwsfm.console import ProgressBars
-    from uwsfm.housing_pipeline import calibrate_housing
-    from uwsfm.sfm.options import MatchOptions, StartOptions
 
-    front_end = StartOptions(
-        matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
-    )
     with ProgressBars() as progress:
+        from uwsfm.housing_pipeline import calibrate_housing
+        from uwsfm.sfm.options import MatchOptions, StartOptions
+
+        front_end = StartOptions(
+            matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+        )
         result = calibrate_housing(
             rig,
             source,
@@ -303,9 +305,10 @@ def refine(
     calibrated in the water or not; the lenses in air are those of the rig file.
     """
     from uwsfm.console import ProgressBars
-    from uwsfm.refine_pipeline import refine_model as run
 
-    with ProgressBars() as progress:
+    with ProgressBars("the same command begins again") as progress:
+        from uwsfm.refine_pipeline import refine_model as run
+
         result = run(
             model,
             rig,
@@ -334,9 +337,10 @@ def demo(
 ) -> None:
     """Run the main job on the sample that comes with the package."""
     from uwsfm.console import ProgressBars, comparison_table, console
-    from uwsfm.demo import run_demo
 
     with ProgressBars() as progress:
+        from uwsfm.demo import run_demo
+
         result, comparison = run_demo(out, mapper, progress)
     _print_result(result.summary)
     console.print(comparison_table(comparison))

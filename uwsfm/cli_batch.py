@@ -21,10 +21,11 @@ def batch(
 
     Run the same command again to go on with those that failed or were stopped.
     """
-    from uwsfm.batch import run_batch
     from uwsfm.console import ProgressBars, batch_table, console
 
     with ProgressBars() as progress:
+        from uwsfm.batch import run_batch
+
         outcomes = run_batch(
             dives, scheduler=scheduler, num_threads=threads, progress=progress
         )

@@ -54,10 +54,11 @@ def dense(
     Run the same command again to go on with a run that was stopped.
     """
     from uwsfm.console import ProgressBars, console
-    from uwsfm.dense.options import bytes_of
-    from uwsfm.dense.run import dense_cloud
 
     with ProgressBars() as progress:
+        from uwsfm.dense.options import bytes_of
+        from uwsfm.dense.run import dense_cloud
+
         result = dense_cloud(
             out,
             images,

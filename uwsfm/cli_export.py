@@ -2,14 +2,12 @@
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
+from uwsfm._signals import NOTHING_WRITTEN, interruptible
 from uwsfm.errors import InputError
-
-if TYPE_CHECKING:
-    from uwsfm.colmap import Model
 
 
 def export(
@@ -38,8 +36,6 @@ def export(
     ] = None,
 ) -> None:
     """Write a reconstruction for other programs."""
-    from uwsfm.export.files import read_model, unit_of_model
-
     if images is not None and to != "pinhole":
         raise InputError(f"--images: --to {to} writes no images")
     if to in ("las", "laz"):
@@ -47,20 +43,27 @@ def export(
         return
     if model.is_file():
         raise InputError(f"{model} is a file: only --to las and laz take a PLY")
-    found = read_model(model)
     if to == "pinhole":
-        _export_pinhole(found, out, images)
-    elif to == "refractive-colmap":
-        from uwsfm.export.refractive_colmap import export_refractive_colmap
-
-        export_refractive_colmap(found, out)
+        _export_pinhole(model, out, images)
     else:
-        from uwsfm.export.scene_ply import export_scene_ply
-
-        export_scene_ply(found, out, unit=unit_of_model(model))
+        _export_whole(model, out, to)
     typer.echo(f"wrote {out}")
 
 
+@interruptible()
+def _export_whole(model: Path, out: Path, to: str) -> None:
+    from uwsfm.export.files import read_model, unit_of_model
+    from uwsfm.export.refractive_colmap import export_refractive_colmap
+    from uwsfm.export.scene_ply import export_scene_ply
+
+    found = read_model(model)
+    if to == "refractive-colmap":
+        export_refractive_colmap(found, out)
+    else:
+        export_scene_ply(found, out, unit=unit_of_model(model))
+
+
+@interruptible()
 def _export_las(source: Path, out: Path, suffix: str) -> None:
     from rich.markup import escape
 
@@ -74,12 +77,14 @@ def _export_las(source: Path, out: Path, suffix: str) -> None:
     typer.echo(f"wrote {out}: {len(cloud)} points")
 
 
-def _export_pinhole(model: "Model", out: Path, images: Path | None) -> None:
+def _export_pinhole(model: Path, out: Path, images: Path | None) -> None:
     from uwsfm.console import ProgressBars, console, pinhole_table
-    from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
 
-    with ProgressBars() as progress:
-        found = export_pinhole(model, out, images, progress)
+    with ProgressBars(NOTHING_WRITTEN) as progress:
+        from uwsfm.export.files import read_model
+        from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
+
+        found = export_pinhole(read_model(model), out, images, progress)
     console.print(pinhole_table(pinhole_report(found)))
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from uwsfm._signals import interruptible
 from uwsfm.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ _PICK = (
 )
 
 
+@interruptible()
 def measure(
     out: Annotated[
         Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from uwsfm._signals import NOTHING_WRITTEN, interruptible
+
 simulate_app = typer.Typer(
     help="Synthetic dives with known truth.", no_args_is_help=True
 )
@@ -32,9 +34,10 @@ def simulate_images(
 ) -> None:
     """Render stereo pairs through their ports, with a rig file and the truth."""
     from uwsfm.console import ProgressBars
-    from uwsfm.simulate.commands import simulate_images as run
 
-    with ProgressBars() as progress:
+    with ProgressBars(NOTHING_WRITTEN) as progress:
+        from uwsfm.simulate.commands import simulate_images as run
+
         run(
             out,
             preset=preset,
@@ -47,6 +50,7 @@ def simulate_images(
 
 
 @simulate_app.command("observations")
+@interruptible()
 def simulate_observations(
     out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file.")],
     trajectory: Annotated[

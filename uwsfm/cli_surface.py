@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from uwsfm._signals import NOTHING_WRITTEN, interruptible
+
 SourceArgument = Annotated[
     Path,
     typer.Argument(
@@ -23,6 +25,7 @@ UpOption = Annotated[
 ]
 
 
+@interruptible()
 def clean(
     source: SourceArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="The PLY file to write.")],
@@ -78,6 +81,7 @@ def clean(
     typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
 
 
+@interruptible()
 def mesh(
     source: SourceArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
@@ -128,6 +132,7 @@ def mesh(
     typer.echo(f"wrote {out}: mesh.ply, mesh.obj, mesh.glb, web.glb, mesh.json")
 
 
+@interruptible()
 def map_(
     source: SourceArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
@@ -204,10 +209,11 @@ def color(
     """
     from rich.markup import escape
 
-    from uwsfm.color.commands import correct_colors
     from uwsfm.console import ProgressBars, console
 
-    with ProgressBars() as progress:
+    with ProgressBars(NOTHING_WRITTEN) as progress:
+        from uwsfm.color.commands import correct_colors
+
         report = correct_colors(
             model,
             out,

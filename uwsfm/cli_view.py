@@ -5,11 +5,14 @@ from typing import Annotated
 
 import typer
 
+from uwsfm._signals import interruptible
+
 OutArgument = Annotated[
     Path, typer.Argument(metavar="OUT", help="A result folder of uwsfm.")
 ]
 
 
+@interruptible()
 def report(out: OutArgument) -> None:
     """Write report.html of a result folder again, with what has come since."""
     from uwsfm.report.files import write_report
@@ -17,6 +20,7 @@ def report(out: OutArgument) -> None:
     typer.echo(f"wrote {write_report(out)}")
 
 
+@interruptible()
 def view(
     out: OutArgument,
     rerun: Annotated[

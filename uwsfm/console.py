@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from uwsfm._signals import raise_on_sigterm
+from uwsfm._signals import RESUMES, raise_on_sigterm, tell_interrupted
 
 if TYPE_CHECKING:
     from uwsfm.batch import Outcome
@@ -30,9 +30,16 @@ errors = Console(stderr=True)
 
 
 class ProgressBars:
-    """Draws `uwsfm._progress.Progress` reports, one bar per step."""
+    """Draws `uwsfm._progress.Progress` reports, one bar per step.
 
-    def __init__(self) -> None:
+    SIGTERM is an exception from its start on: what takes long to import comes after.
+
+    Args:
+        left: what is told if the command is interrupted.
+    """
+
+    def __init__(self, left: str = RESUMES) -> None:
+        self._left = left
         self._progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description}"),
@@ -53,7 +60,7 @@ class ProgressBars:
         if self._tasks:  # else a blank line would be drawn
             self._progress.stop()
         if failure is not None and issubclass(failure, KeyboardInterrupt):
-            errors.print("interrupted; the same command resumes the run")
+            tell_interrupted(self._left)
 
     def __call__(self, step: str, done: int, total: int | None) -> None:
         if not self._tasks:

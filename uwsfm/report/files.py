@@ -105,10 +105,8 @@ def write_files(
     if folder.exists() and not (folder / NUMBERS).is_file():
         raise InputError(f"{folder} exists and was not made by uwsfm: move it away")
     report = gather(model, covariance, summary, out)
-    with replaced_dir(folder) as partial:
-        write_json(numbers_of(report), partial / NUMBERS)
-        draw_pictures(report, partial)
-    text = page_of(report)
-    with replaced_file(page) as partial:
-        partial.write_text(text, encoding="utf-8")
+    with replaced_file(page) as partial, replaced_dir(folder) as drawn:
+        partial.write_text(page_of(report), encoding="utf-8")
+        write_json(numbers_of(report), drawn / NUMBERS)
+        draw_pictures(report, drawn)
     return page

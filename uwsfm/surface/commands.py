@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import replaced_dir
+from uwsfm._files import replaced_dir, replaced_file
 from uwsfm._packages import import_package
 from uwsfm._ply import write_ply
 from uwsfm.cloud import Cloud
@@ -79,8 +79,9 @@ def clean_cloud(
         "filters": [asdict(item) for item in filters],
     }
     comment = f"unit: {found.unit}; made by uwsfm clean"
-    write_ply(target, [("vertex", table[keep])], comment=comment)
-    write_json(report, report_path)
+    with replaced_file(report_path) as told, replaced_file(target) as partial:
+        write_ply(partial, [("vertex", table[keep])], comment=comment)
+        write_json(report, told)
     return report
 
 
