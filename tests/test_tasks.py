@@ -153,7 +153,8 @@ def test_a_signal_to_the_whole_group_ends_all_processes_without_a_word():
 
 
 ORPHANS = """
-import os, psutil, signal, time
+import os, psutil, signal, sys, time
+from pathlib import Path
 from uwsfm.tasks import Workers
 
 def kill(step, done, total):
@@ -162,24 +163,26 @@ def kill(step, done, total):
         print(*[child.pid for child in children], flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
 
-with Workers(max_processes=2) as workers:
+with Workers(folder=Path(sys.argv[1]), max_processes=2) as workers:
     workers.run(time.sleep, [(1.0,) for _ in range(4)], "sleeping", kill)
 """
 
 
 @pytest.mark.slow
-def test_processes_end_when_who_started_them_is_killed():
-    """No script guards its main part, and none has to."""
-    found = subprocess.run(
-        [sys.executable, "-c", ORPHANS], stdout=subprocess.PIPE, text=True, check=False
-    )
+def test_processes_end_when_who_started_them_is_killed(tmp_path):
+    """No script guards its main part, and none has to; the next run clears up."""
+    command = [sys.executable, "-c", ORPHANS, str(tmp_path / "work")]
+    found = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     assert found.returncode == -signal.SIGKILL
+    assert len(list((tmp_path / "work").iterdir())) == 1
+    Steps(tmp_path / "work")
     orphans = [int(word) for word in found.stdout.split()]
     assert len(orphans) >= 3  # a scheduler and two workers, with who watches them
     deadline = time.monotonic() + 90.0  # three times what they wait for a task
     while any(psutil.pid_exists(orphan) for orphan in orphans):
         assert time.monotonic() < deadline
         time.sleep(1.0)
+    assert not list((tmp_path / "work").iterdir())
 
 
 @contextmanager

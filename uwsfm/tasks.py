@@ -18,6 +18,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from uwsfm._files import PARTIAL
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
@@ -48,7 +49,8 @@ class Workers:
     Args:
         scheduler: "local": processes of this machine, which start when there is more
             than one task for them; or the address of a Dask scheduler.
-        folder: Through which tasks exchange files; see `require_sight`.
+        folder: Through which tasks exchange files; see `require_sight`. Processes of
+            this machine keep theirs there, too; None: in the temporary folder.
         max_processes: Of this machine; one is this process itself. None: as many as
             there are cores, and memory for.
 
@@ -67,7 +69,7 @@ class Workers:
         self.num_processes = local_workers()
         if max_processes is not None:
             self.num_processes = min(self.num_processes, max_processes)
-        self._folder = folder
+        self._folder = None if folder is None else folder.absolute()
         self._client: Client | None = None
         self._resources = ExitStack()
         require_address(scheduler)
@@ -170,8 +172,11 @@ class Workers:
 
         _log_as_all_do()
         logger.info("starting %d worker processes", self.num_processes)
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        # In a workspace, what a killed run could not remove is gone with the next.
         scratch = processes.enter_context(
-            tempfile.TemporaryDirectory(prefix="uwsfm-dask-")
+            tempfile.TemporaryDirectory(prefix=PARTIAL, dir=self._folder)
         )
         common: dict[str, Any] = {
             "n_workers": self.num_processes,
