@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwsfm import Distances, InputError, Lengths, Positions, calibrate, verdicts
-from uwsfm.calibration.outside import scaled
+from uwsfm.calibration.scaling import scaled
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align

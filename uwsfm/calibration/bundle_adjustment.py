@@ -12,13 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import Outside, moved
+from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.problem import (
     CalibrateOptions,
     CalibrateSummary,
     CalibrationResult,
 )
 from uwsfm.calibration.run import MIN_SIGMA_PX, Run, Solved
+from uwsfm.calibration.scaling import moved
 from uwsfm.calibration.uncertainty import posterior_covariance
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3

@@ -10,8 +10,8 @@ from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.clicks import check_clicks, with_click_noise
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import scaled, start_scale
 from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.scaling import scaled, start_scale
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
 from uwsfm.rig import Rig
