@@ -20,12 +20,17 @@ from uwsfm.cli_options import (
     LengthsOption,
     LeverArmOption,
     MapperOption,
+    MatcherOption,
     PositionsOption,
     PriorOption,
     RefineOption,
     ReportOption,
+    ResultsOption,
+    RigArgument,
     SceneDistanceOption,
     SchedulerOption,
+    SeedOption,
+    ThreadsOption,
     lever_arm_of,
     priors_of,
     wanted_of,
@@ -118,11 +123,11 @@ def init(
 
 @app.command()
 def reconstruct(
-    rig: Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")],
+    rig: RigArgument,
     images: Annotated[
         Path, typer.Argument(help="Folder that holds one folder of images per camera.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    out: ResultsOption,
     clahe: Annotated[
         bool, typer.Option(help="Raise the local contrast first: for turbid water.")
     ] = False,
@@ -137,10 +142,7 @@ def reconstruct(
             "look alike; auto: exhaustive up to 60 frames."
         ),
     ] = "auto",
-    matcher: Annotated[
-        Literal["colmap", "paper"],
-        typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
-    ] = "colmap",
+    matcher: MatcherOption = "colmap",
     mapper: MapperOption = "refractive",
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
@@ -148,10 +150,8 @@ def reconstruct(
     scene_distance: SceneDistanceOption = None,
     also: RefineOption = None,
     prior: PriorOption = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
-    ] = 0,
-    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+    seed: SeedOption = 0,
+    threads: ThreadsOption = -1,
     submap_frames: Annotated[
         int | None,
         typer.Option(
@@ -201,7 +201,7 @@ def reconstruct(
 
 @app.command()
 def calibrate(
-    rig: Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")],
+    rig: RigArgument,
     source: Annotated[
         Path,
         typer.Argument(
@@ -209,7 +209,7 @@ def calibrate(
             help="Folder of images, one folder per camera; or a COLMAP model of them.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    out: ResultsOption,
     strategy: Annotated[
         Literal["joint", "nested"],
         typer.Option(help="All at once, or the two loops of the 2011 paper."),
@@ -236,15 +236,10 @@ def calibrate(
     positions: PositionsOption = None,
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
-    matcher: Annotated[
-        Literal["colmap", "paper"],
-        typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
-    ] = "colmap",
+    matcher: MatcherOption = "colmap",
     scene_distance: SceneDistanceOption = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
-    ] = 0,
-    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+    seed: SeedOption = 0,
+    threads: ThreadsOption = -1,
 ) -> None:
     """Calibrate the ports only: housing.yaml, and what the images tell of it."""
     from uwsfm.console import ProgressBars
@@ -281,8 +276,8 @@ def refine(
     model: Annotated[
         Path, typer.Argument(help="Folder of a COLMAP model of the raw images.")
     ],
-    rig: Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    rig: RigArgument,
+    out: ResultsOption,
     images: Annotated[
         Path | None,
         typer.Option(help="Folder of the cameras' folders, for the points' colours."),
@@ -330,9 +325,7 @@ def refine(
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the results.")
-    ] = Path("uwsfm-demo"),
+    out: ResultsOption = Path("uwsfm-demo"),
     mapper: MapperOption = "refractive",
 ) -> None:
     """Run the main job on the sample that comes with the package."""

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from uwsfm.cli_options import ThreadsOption
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -47,7 +49,7 @@ def dense(
     max_memory: Annotated[
         str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
     ] = "2GB",
-    threads: Annotated[int, typer.Option(min=-1, help="-1: all cores.")] = -1,
+    threads: ThreadsOption = -1,
 ) -> None:
     """Make a dense cloud: every pixel's depth along its exact water ray.
 

@@ -35,8 +35,18 @@ PriorOption = Annotated[
         show_default=False,
     ),
 ]
-
-
+RigArgument = Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")]
+ResultsOption = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder for the results.")
+]
+MatcherOption = Annotated[
+    Literal["colmap", "paper"],
+    typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
+]
+SeedOption = Annotated[
+    int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
+]
+ThreadsOption = Annotated[int, typer.Option(min=-1, help="-1: all cores.")]
 MapperOption = Annotated[
     Literal["pinhole", "refractive"],
     typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
