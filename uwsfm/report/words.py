@@ -157,7 +157,10 @@ def _source(summary: dict[str, Any]) -> str:
         count = used["num_positions"] - len(used["outliers"])
         sources.append(f"{count} positions of frames")
     if not sources:
-        return "Its scale comes from refraction alone, with the port taken as given."
+        return (
+            "Its scale comes from refraction alone, with the port taken as given; "
+            "errors of the port come on top."
+        )
     text = f"Its scale comes from {', and from '.join(sources)}."
     if baseline is not None and stddev == 0.0 and len(sources) == 1:
         text += " One per cent wrong there is one per cent wrong everywhere."
