@@ -204,6 +204,39 @@ def test_a_wrong_lever_arm_shows(rng):
     assert 0.1 < np.median(misses) < 2.0 * np.linalg.norm(ARM)
 
 
+MIRRORED = {"x and y swapped": [1, 0, 2], "z of the wrong sign": [1.0, 1.0, -1.0]}
+
+
+@pytest.mark.parametrize("rig", [paper_rig(), one_camera()], ids=["stereo", "mono"])
+@pytest.mark.parametrize("mistake", MIRRORED)
+@pytest.mark.parametrize("frames", [[0, 2, 4, 5, 7, 9], list(range(10))])
+def test_mirrored_axes_are_no_outliers(rig, mistake, frames, rng):
+    simulated = dive(rig, rich_motion(10), num_points=100)
+    scene = scaled_start(simulated.scene)
+    found, _ = tracked(simulated.truth, rng)
+    how = MIRRORED[mistake]
+    wrong = found[:, how] if isinstance(how[0], int) else found * how
+    for places in (found, wrong):
+        known = Positions.from_arrays(
+            frames, places[frames], np.full(3, NAV_STDDEV), ARM
+        )
+        lengths = Lengths(positions=known)
+        if places is found:
+            assert calibrate(scene, lengths=lengths).positions.num_outliers == 0
+        else:
+            with pytest.raises(InputError, match="the axes of the positions are mirr"):
+                calibrate(scene, lengths=lengths)
+
+
+def test_of_four_positions_mirrored_axes_and_a_wrong_one_are_both_named(rng):
+    """Three fit any frame: nothing tells the two apart."""
+    simulated = dive(paper_rig(), rich_motion(10), num_points=100)
+    found = tracked(simulated.truth, rng)[0][:4] * [1.0, 1.0, -1.0]
+    result = calibrate(simulated.scene, lengths=positions(found))
+    told = verdicts(result, ["left", "right"])[0]
+    assert told.startswith("1 of 4 positions contradict") and "mirrored axes" in told
+
+
 def test_a_straight_track_leaves_the_turn_about_it_open(rng):
     simulated = dive(paper_rig(), straight_strip(15, spacing=0.2))
     found, _ = tracked(simulated.truth, rng)

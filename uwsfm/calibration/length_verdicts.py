@@ -19,6 +19,8 @@ CONTRADICTION = 4.0
 # Standard deviations given for positions are wrong by more than chance and optimism.
 SCATTERED = 2.0
 MANY_OUTLIERS = 0.4
+# Fewer positions than this agree with a mirrored frame, but for one or two of them.
+FEW_POSITIONS = 10
 
 
 def scale_verdict(scale_stddev: float | None) -> str:
@@ -87,6 +89,11 @@ def _positions(fit: PositionFit) -> list[str]:
     )
     if wrong:
         advice = f": {check}" if wrong > MANY_OUTLIERS * count else ""
+        if count < FEW_POSITIONS:
+            advice = (
+                "; with so few, mirrored axes (two swapped, or one of the wrong sign) "
+                f"look like that too: {check}"
+            )
         sentences.append(
             f"{wrong} of {count} positions contradict the images and were left out"
             f"{advice}"

@@ -8,6 +8,7 @@ from uwsfm.calibration.lengths import Distances, LengthFit, Lengths, PositionFit
 from uwsfm.calibration.scaling import (
     alignment,
     require_metres,
+    require_right_handed,
     scaled,
     start_scale,
     with_seen_positions,
@@ -208,10 +209,15 @@ class Outside:
         """Choose the positions to believe, and how well; whether that is new.
 
         Raises:
-            UwsfmError: fewer than three agree with the images.
+            InputError: they agree with the images as a mirror image only.
+            UwsfmError: fewer than three agree.
         """
         if not self.navigation:
             return False
+        if self.robust:
+            require_right_handed(
+                state.rig_from_world, self.lengths, with_scale=self.one_camera
+            )
         before = (self.robust, self.scatter, self.inliers)
         squares = np.where(self.present, self.squares(state), np.inf)
         middle = float(np.median(squares[self.present]))

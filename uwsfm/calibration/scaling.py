@@ -1,4 +1,4 @@
-"""A scene brought near the lengths from outside: its scale, its place, its unit."""
+"""A scene brought near the lengths from outside: their unit and axes checked."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from uwsfm.calibration.lengths import Distances, Lengths
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.alignment import Similarity, align_robustly
+from uwsfm.geometry.alignment import Similarity, align_robustly, fits_mirrored
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene
 from uwsfm.solver.terms import centers
@@ -71,13 +71,41 @@ def alignment(scene: Scene, lengths: Lengths, *, with_scale: bool) -> Similarity
 
     With a scale, the lever arm is taken as it is: it is short against the track.
     """
+    return align_robustly(
+        *_matched(scene.rig_from_world, lengths), with_scale=with_scale
+    )
+
+
+def _matched(rig_from_world: Array, lengths: Lengths) -> tuple[Array, Array, Array]:
+    """The antenna in the world (M, 3), its positions (M, 3), and their covariances."""
     known = lengths.positions
     assert known is not None
-    poses = rigid3.inverse(scene.rig_from_world[known.frame_idx])
+    poses = rigid3.inverse(rig_from_world[known.frame_idx])
     antenna = rigid3.transform(poses, known.lever_arm)
-    return align_robustly(
-        antenna, known.positions, known.covariances, with_scale=with_scale
-    )
+    return antenna, known.positions, known.covariances
+
+
+def require_right_handed(
+    rig_from_world: Array, lengths: Lengths, *, with_scale: bool
+) -> None:
+    """See to it that the axes of the positions are not mirrored, as far as they tell.
+
+    Args:
+        rig_from_world: poses (F, 7) that the images were adjusted to: before, the map's
+            own errors look like those of positions.
+        lengths: with positions.
+        with_scale: the images do not tell the scale.
+
+    Raises:
+        InputError: the positions fit as a mirror image, and not as they are.
+    """
+    if fits_mirrored(*_matched(rig_from_world, lengths), with_scale=with_scale):
+        raise InputError(
+            "the axes of the positions are mirrored: with two of x, y, z swapped, or "
+            "the sign of one changed, they fit the images, and as they are they do "
+            "not; give a right-handed frame, such as east, north, up or north, east, "
+            "down"
+        )
 
 
 def require_metres(scene: Scene, lengths: Lengths) -> None:

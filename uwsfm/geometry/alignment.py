@@ -15,6 +15,12 @@ MEDIAN_CHI2_3 = 2.366
 """Median of the squared length of a 3-D standard normal vector."""
 LIMIT_CHI2_3 = 16.27
 """One in a thousand is beyond it."""
+ENOUGH = 300
+"""Places that tell a mirror image; all of a long survey would take seconds."""
+MUCH_BETTER = 2.0
+"""Times less in squares. Of 3800 simulated tracks of 4 to 10 places, clean or a third
+of them wrong, none seemed mirrored; of mirrored ones that are not flat, nearly half
+of those of five places are told, and nine in ten of those of ten."""
 
 
 class Similarity(NamedTuple):
@@ -77,6 +83,44 @@ def align_robustly(
             break
         found = align(x, y, near * weights, with_scale=with_scale)
     return found
+
+
+def fits_mirrored(x: Array, y: Array, covariances: Array, *, with_scale: bool) -> bool:
+    """Whether places fit much better as their mirror image: axes of y are left-handed.
+
+    Which of them is wrong does not matter: two swapped and one of the wrong sign differ
+    by a rotation. Places in a plane are their own mirror image and do not tell.
+
+    Args:
+        x, y, covariances, with_scale: as of `align_robustly`.
+    """
+    if len(x) > ENOUGH:
+        rows = np.linspace(0, len(x) - 1, ENOUGH).astype(int)
+        x, y, covariances = x[rows], y[rows], covariances[rows]
+    inverses = np.linalg.inv(covariances)
+
+    def squares(x: Array, found: Similarity) -> Array:
+        miss = found.apply(x) - y
+        return np.einsum("ni,nij,nj->n", miss, inverses, miss)
+
+    image = x * [-1.0, 1.0, 1.0]
+    as_image = squares(
+        image, align_robustly(image, y, covariances, with_scale=with_scale)
+    )
+    # The robust fit may take some of few right places for wrong; all together do not.
+    weights = 3.0 / np.trace(covariances, axis1=1, axis2=2)
+    as_given = (
+        align_robustly(x, y, covariances, with_scale=with_scale),
+        align(x, y, weights, with_scale=with_scale),
+    )
+    spread = max(1.0, float(np.median(as_image)) / MEDIAN_CHI2_3)
+    # A wrong place counts no more than one at the limit does.
+    image_cost = float(np.sum(np.minimum(as_image / spread, LIMIT_CHI2_3)))
+    cost = min(
+        float(np.sum(np.minimum(squares(x, found) / spread, LIMIT_CHI2_3)))
+        for found in as_given
+    )
+    return cost > max(MUCH_BETTER * image_cost, image_cost + LIMIT_CHI2_3)
 
 
 def _align(
