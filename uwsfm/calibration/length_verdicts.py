@@ -59,8 +59,8 @@ def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
             "the scale comes from refraction alone, with the port taken as given, and "
             "errors of the port come on top of its standard deviation: if the port's "
             "distance from the lens is 1 % wrong, all lengths are, about, and a tilt "
-            "of a degree or two that was not given can put them off by many standard "
-            "deviations, or make them twice as long"
+            "of a degree or two that was not given can put them off by several "
+            "standard deviations, or make them twice as long"
         )
     if result.lengths is not None:
         sentences += _contradicted(result.lengths)
