@@ -108,7 +108,7 @@ def _add_pose_row(a, x, y, z, m0, m1, m2, f, frames):
 
 
 @lane
-def _times_rotation(m0, m1, m2, frame):
+def times_rotation(m0, m1, m2, frame):
     """Row of H R."""
     r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
     return (
@@ -116,6 +116,19 @@ def _times_rotation(m0, m1, m2, frame):
         m0 * r12 + m1 * r22 + m2 * r32,
         m0 * r13 + m1 * r23 + m2 * r33,
     )
+
+
+@inner_fused
+def add_to_point(p, frame, a, b, d, g0, g1, g2, grad, v):
+    """R^T H R and R^T g of a cell, to those of its point; H R by rows."""
+    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
+    grad[p, 0] += r11 * g0 + r21 * g1 + r31 * g2
+    grad[p, 1] += r12 * g0 + r22 * g1 + r32 * g2
+    grad[p, 2] += r13 * g0 + r23 * g1 + r33 * g2
+    for k in range(3):
+        v[p, 0, k] += r11 * a[k] + r21 * b[k] + r31 * d[k]
+        v[p, 1, k] += r12 * a[k] + r22 * b[k] + r32 * d[k]
+        v[p, 2, k] += r13 * a[k] + r23 * b[k] + r33 * d[k]
 
 
 @inner_fused
@@ -159,9 +172,9 @@ def add_cell(
     _add_pose_row(row3, x, y, z, h00, h10, h20, f, frames)
     _add_pose_row(row4, x, y, z, h10, h11, h21, f, frames)
     _add_pose_row(row5, x, y, z, h20, h21, h22, f, frames)
-    a = _times_rotation(h00, h10, h20, frame)
-    b = _times_rotation(h10, h11, h21, frame)
-    d = _times_rotation(h20, h21, h22, frame)
+    a = times_rotation(h00, h10, h20, frame)
+    b = times_rotation(h10, h11, h21, frame)
+    d = times_rotation(h20, h21, h22, frame)
     cells[c, 3, 0], cells[c, 3, 1], cells[c, 3, 2] = x, y, z
     q0, q1, q2 = _torque(x, y, z, g0, g1, g2)
     frames_grad[f, 0] += q0
@@ -170,19 +183,13 @@ def add_cell(
     frames_grad[f, 3] += g0
     frames_grad[f, 4] += g1
     frames_grad[f, 5] += g2
-    r11, r12, r13, r21, r22, r23, r31, r32, r33 = frame
-    grad[p, 0] += r11 * g0 + r21 * g1 + r31 * g2
-    grad[p, 1] += r12 * g0 + r22 * g1 + r32 * g2
-    grad[p, 2] += r13 * g0 + r23 * g1 + r33 * g2
     for k in range(3):
         cells[c, 0, k], cells[c, 1, k], cells[c, 2, k] = a[k], b[k], d[k]
-        v[p, 0, k] += r11 * a[k] + r21 * b[k] + r31 * d[k]
-        v[p, 1, k] += r12 * a[k] + r22 * b[k] + r32 * d[k]
-        v[p, 2, k] += r13 * a[k] + r23 * b[k] + r33 * d[k]
+    add_to_point(p, frame, a, b, d, g0, g1, g2, grad, v)
 
 
 @inner_fused
-def _sum_rows(rows, first, last):
+def sum_rows(rows, first, last):
     """J^T W J by the point in the rig (lower triangle), J^T W r: 9 scalars."""
     h00, h10, h11, h20, h21, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     g0, g1, g2 = 0.0, 0.0, 0.0
@@ -219,7 +226,7 @@ def assemble(layout, state, first_point, last_point, first, chunk, sums, out):
             start, end = cell_start[c] - first, cell_start[c + 1] - first
             frame, f = rotation(poses, cell_frame[c]), row_of[cell_frame[c]]
             x, y, z = in_rig[start, 0], in_rig[start, 1], in_rig[start, 2]
-            total = _sum_rows(rows, start, end)
+            total = sum_rows(rows, start, end)
             add_cell(
                 x, y, z, frame, p, c, f, total, frames, frames_grad, cells, grads, v
             )

@@ -5,17 +5,19 @@ BLAS. The blocks of the inverse at the places of the factor's follow from the la
 to the first (Takahashi, Fagan & Chen 1973), without the inverse.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.linalg import blas, lapack
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.elimination_tree import EliminationTree, Front
 
-SOLVED_AT_ONCE = 48
-"""Rows, by a triangle that the L1 cache holds."""
+ROWS_AT_ONCE = 48
+"""That are eliminated by a triangle, which the L1 cache holds."""
 
 
 class Panel(NamedTuple):
@@ -110,7 +112,8 @@ class _Pool:
     """Square arrays that factors use again: new pages would have to be cleared, which
     took as long as a quarter of the sums."""
 
-    def __init__(self) -> None:
+    def __init__(self, dtype: DTypeLike) -> None:
+        self._dtype = dtype
         self._free: list[Array] = []
 
     def take(self, size: int) -> Array:
@@ -122,7 +125,7 @@ class _Pool:
         else:
             if self._free:  # one grows; the others wait for smaller fronts
                 self._free.pop(max(range(len(self._free)), key=self._size))
-            flat = np.empty(size * size)
+            flat = np.empty(size * size, self._dtype)
         return flat[: size * size].reshape(size, size)
 
     def give(self, square: Array) -> None:
@@ -134,39 +137,44 @@ class _Pool:
         return self._free[number].size
 
 
-def _solve_rows(own: Array, rest: Array) -> None:
-    """R12 = R11^-T A12 in place, most of it by products of matrices: BLAS solves at
-    half their speed."""
-    for first in range(0, len(own), SOLVED_AT_ONCE):
-        part = slice(first, first + SOLVED_AT_ONCE)
-        if first:
-            rest[part] -= own[:first, part].T @ rest[:first]
-        blas.dtrsm(
-            1.0,
-            np.ascontiguousarray(own[part, part]).T,
-            rest[part].T,
-            side=1,
-            lower=1,
-            trans_a=1,
-            overwrite_b=1,
+class _Functions(NamedTuple):
+    """Of BLAS and LAPACK, for one kind of numbers."""
+
+    potrf: Callable
+    trtri: Callable
+    trmm: Callable
+    trsm: Callable
+    syrk: Callable
+
+    @classmethod
+    def of(cls, dtype: DTypeLike) -> "_Functions":
+        factors = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
+        return cls(
+            *factors, *blas.get_blas_funcs(("trmm", "trsm", "syrk"), dtype=dtype)
         )
 
 
 class BlockCholesky:
     """A factor L of the frames' part, A = L L^T in the order of a tree."""
 
-    def __init__(self, tree: EliminationTree) -> None:
+    def __init__(self, tree: EliminationTree, dtype: DTypeLike = np.float64) -> None:
+        """Args:
+        tree: of the frames.
+        dtype: of the factor and its sums.
+        """
         self.order = tree.order
+        self._dtype = dtype
         self._fronts = tree.fronts
         self._panels: list[Panel] = [
             Panel(
-                np.empty((6 * f.num_pivots, 6 * f.num_pivots)),
-                np.empty((6 * f.num_pivots, 6 * len(f.rows))),
+                np.empty((6 * f.num_pivots, 6 * f.num_pivots), dtype),
+                np.empty((6 * f.num_pivots, 6 * len(f.rows)), dtype),
             )
             for f in tree.fronts
         ]
         self._rows = [_in_columns(f) for f in tree.fronts]
-        self._pool = _Pool()
+        self._pool = _Pool(dtype)
+        self._functions = _Functions.of(dtype)
 
     def factorize(self, blocks: Array) -> bool:
         """Factor blocks (number of blocks, 6, 6); False if they are not positive."""
@@ -178,15 +186,15 @@ class BlockCholesky:
             given = [updates.pop(child) for child in front.children]
             for update, places in zip(given, front.maps, strict=True):
                 _add_to_pivots(update, places, own, rest)
-            # Fortran reads rows as columns: our upper triangles are its lower ones.
-            _, info = lapack.dpotrf(own.T, lower=1, clean=0, overwrite_a=1)
-            if info != 0:
+            if not self._eliminate(own, rest):
                 return False
             if rest.size:
-                _solve_rows(own, rest)
                 after = self._pool.take(rest.shape[1])
+                # Fortran reads rows as columns: our upper triangles are its lower ones.
                 # Written, then added to: nothing to zero beforehand.
-                blas.dsyrk(-1.0, rest.T, beta=0.0, c=after.T, lower=1, overwrite_c=1)
+                self._functions.syrk(
+                    -1.0, rest.T, beta=0.0, c=after.T, lower=1, overwrite_c=1
+                )
                 for update, places in zip(given, front.maps, strict=True):
                     _add_to_rows(update, places, len(own), after)
                 updates[number] = after
@@ -196,14 +204,46 @@ class BlockCholesky:
         # is what the pool's arrays held.
         return bool(np.isfinite([p.own[-1, -1] for p in self._panels]).all())
 
+    def _eliminate(self, own: Array, rest: Array) -> bool:
+        """Rows of L^T in place, a few at a time: most of it products of matrices. The
+        inverse of a small triangle times all columns is one, too; BLAS would solve at
+        half the speed."""
+        potrf, trtri, trmm = self._functions[:3]
+        for first in range(0, len(own), ROWS_AT_ONCE):
+            part = slice(first, first + ROWS_AT_ONCE)
+            if first:
+                above = own[:first, part].T
+                own[part, first:] -= above @ own[:first, first:]
+                rest[part] -= above @ rest[:first]
+            square = np.ascontiguousarray(own[part, part])
+            _, info = potrf(square.T, lower=1, clean=0, overwrite_a=1)
+            if info != 0:
+                return False
+            inverse, _ = trtri(square.T, lower=1)
+            own[part, part] = square
+            after = np.ascontiguousarray(own[part, first + len(square) :])
+            for columns in (after, rest[part]):
+                if columns.size:
+                    trmm(
+                        1.0,
+                        inverse,
+                        columns.T,
+                        side=1,
+                        lower=1,
+                        trans_a=1,
+                        overwrite_b=1,
+                    )
+            own[part, first + len(square) :] = after
+        return True
+
     def solve_half(self, right: Array) -> Array:
         """L^-1 times columns (6 n, r) in the factor's order."""
-        out = right.copy()
+        out = right.astype(self._dtype)
         for front, panel, rows in zip(
             self._fronts, self._panels, self._rows, strict=True
         ):
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
-            blas.dtrsm(
+            self._functions.trsm(
                 1.0, panel.own.T, part.T, side=1, lower=1, trans_a=1, overwrite_b=1
             )
             if len(rows):
@@ -212,14 +252,16 @@ class BlockCholesky:
 
     def solve_other_half(self, right: Array) -> Array:
         """L^-T times columns (6 n, r)."""
-        out = right.copy()
+        out = right.astype(self._dtype)
         for front, panel, rows in zip(
             self._fronts[::-1], self._panels[::-1], self._rows[::-1], strict=True
         ):
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
             if len(rows):
                 part -= panel.rest @ out[rows]
-            blas.dtrsm(1.0, panel.own.T, part.T, side=1, lower=1, overwrite_b=1)
+            self._functions.trsm(
+                1.0, panel.own.T, part.T, side=1, lower=1, overwrite_b=1
+            )
         return out
 
     def inverse_blocks(self, blocks: Array) -> None:
@@ -229,7 +271,7 @@ class BlockCholesky:
             front = self._fronts[number]
             own, rest = self._panels[number]
             after = known.pop(number, np.empty((0, 0)))
-            root, _ = lapack.dtrtri(own.T, lower=1)
+            root, _ = self._functions.trtri(own.T, lower=1)
             root = np.tril(root)  # L11^-1
             inverse, reach = root.T @ root, np.empty_like(rest)
             if rest.size:

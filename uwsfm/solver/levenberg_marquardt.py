@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver import schur
-from uwsfm.solver.error_models import ErrorModel, error_model
+from uwsfm.solver.error_models import REPROJECTION, ErrorModel, error_model
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.normal_equations import (
@@ -27,12 +27,17 @@ from uwsfm.solver.normal_equations import (
 from uwsfm.solver.reduced_steps import StepSolver
 from uwsfm.solver.reduction import DENSE, Reduction, analyse
 from uwsfm.solver.schur import ReducedSystem
+from uwsfm.solver.settling import settled
 from uwsfm.solver.state import State
 from uwsfm.solver.threads import num_threads
 from uwsfm.solver.workspace import Workspace
 
 # Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
 SINGLE_BLAS_BELOW = 1500
+
+FALLS_SHORT = 0.75
+"""Of the predicted decrease; a step below it is tried with settled points, too. Above,
+the damping falls nearly as fast as it may."""
 
 
 class Stop(Enum):
@@ -176,6 +181,12 @@ class Problem:
         )
         return step, points_step
 
+    def settled(self, state: State, damping: float) -> State | None:
+        """Every point moved once more, alone; None for errors that are not pixels."""
+        if self.error.code != REPROJECTION:
+            return None
+        return settled(self._work, state, self._loss, self._scale, damping)
+
     def predicted_decrease(
         self, eqs: NormalEquations, damping: float, step: Array, points_step: Array
     ) -> float:
@@ -240,7 +251,8 @@ def minimize(
     """Minimise a robust error from a start.
 
     Marquardt scaling by max(diagonal, 1e-6); the damping falls by
-    max(1/10, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure.
+    max(1/10, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure. A
+    step that falls short is tried with settled points, too: `uwsfm.solver.settling`.
 
     Raises:
         UwsfmError: the start is so wrong that nothing can be projected.
@@ -277,10 +289,10 @@ def _iterate(
         steps = problem.step(eqs, damping)
         decrease, predicted = -1.0, 1.0
         if steps is not None:
-            trial = state.moved(problem.layout, *steps)
-            trial_cost, _ = problem.cost(trial)
-            decrease = cost - trial_cost
             predicted = problem.predicted_decrease(eqs, damping, *steps)
+            trial = state.moved(problem.layout, *steps)
+            trial, trial_cost = _tried(problem, trial, damping, cost, predicted)
+            decrease = cost - trial_cost
         if report is not None:
             report(iterations, min(cost, cost - decrease))
         if decrease > 0.0:
@@ -307,3 +319,17 @@ def _iterate(
         num_iterations=iterations,
         stop=stop,
     )
+
+
+def _tried(
+    problem: Problem, trial: State, damping: float, cost: float, predicted: float
+) -> tuple[State, float]:
+    """A trial state and its cost; its points settled if that is better."""
+    trial_cost, _ = problem.cost(trial)
+    if cost - trial_cost >= FALLS_SHORT * predicted:
+        return trial, trial_cost
+    other = problem.settled(trial, damping)
+    if other is None:
+        return trial, trial_cost
+    other_cost, _ = problem.cost(other)
+    return (other, other_cost) if other_cost < trial_cost else (trial, trial_cost)

@@ -15,6 +15,8 @@ from scipy.sparse.linalg import LinearOperator, onenormest
 
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.solver.banded_cholesky import BandedCholesky
+from uwsfm.solver.block_cholesky import BlockCholesky
 from uwsfm.solver.elimination_tree import permuted
 from uwsfm.solver.quasidefinite import (
     SINGULAR,
@@ -24,6 +26,8 @@ from uwsfm.solver.quasidefinite import (
 )
 from uwsfm.solver.reduction import DENSE, Reduction
 from uwsfm.solver.schur import ReducedSystem
+
+Factor = BlockCholesky | BandedCholesky
 
 
 class Inverse(Protocol):
@@ -120,10 +124,14 @@ class Bordered:
     """
 
     def __init__(
-        self, reduction: Reduction, system: ReducedSystem, num_lengths: int
+        self,
+        reduction: Reduction,
+        factor: Factor,
+        system: ReducedSystem,
+        num_lengths: int,
     ) -> None:
         self.reduction, self.num_lengths = reduction, num_lengths
-        self.factor = reduction.factor
+        self.factor = factor
         num_frames = reduction.graph.num_frames
         columns = np.arange(6 * num_frames).reshape(num_frames, 6)
         border = 6 * num_frames + np.arange(len(system.border))
@@ -136,12 +144,18 @@ class Bordered:
 
     @classmethod
     def of(
-        cls, reduction: Reduction, system: ReducedSystem, num_lengths: int
+        cls,
+        reduction: Reduction,
+        system: ReducedSystem,
+        num_lengths: int,
+        *,
+        rough: bool = False,
     ) -> "Bordered | None":
-        """None if the frames alone are not positive definite."""
-        if not reduction.factor.factorize(system.blocks):
+        """None if the frames alone are not positive definite, as far as digits tell."""
+        factor = reduction.rough_factor if rough else reduction.factor
+        if not factor.factorize(system.blocks):
             return None
-        return cls(reduction, system, num_lengths)
+        return cls(reduction, factor, system, num_lengths)
 
     def _coupling(self, system: ReducedSystem) -> Array:
         """C (6 n, 6 outer frames + B) in the factor's order."""

@@ -1,10 +1,11 @@
-"""Steps of a run of reduced systems, of which each is near the one before.
+"""Steps of a run of reduced systems, by factors that are rough, or of earlier ones.
 
-A factor of a large survey costs as much as ten solutions with it, and the systems of
-the last iterations hardly differ. Conjugate gradients, preconditioned by the factor of
-an earlier system, then take two or three solutions (Nocedal & Wright, Numerical
-Optimization, 2006, algorithm 5.3; 7.1 for why a step may be inexact). Where they would
-take many more, the system gets a factor of its own.
+A step need not be exact (Nocedal & Wright, Numerical Optimization, 2006, section 7.1),
+and a factor of a large survey costs as much as ten solutions with it. Conjugate
+gradients (ibid., algorithm 5.3) in full precision take one or two solutions with a
+factor of seven digits, which costs half; and two or three with that of an earlier
+system, if little has changed, as in the last iterations. Where they would take many
+more, the system gets a factor of its own; one of all digits, if seven do not do.
 """
 
 import numpy as np
@@ -29,6 +30,10 @@ NUMBER_FLOPS = 120.0
 a large product."""
 
 
+WORTH_IT = 3
+"""Solutions, from 1500 frames or so; the factors of smaller surveys cost little."""
+
+
 class StepSolver:
     """Solves the reduced systems of one minimisation, one after another."""
 
@@ -38,8 +43,9 @@ class StepSolver:
         num_lengths: how many of their last columns are lengths.
         """
         self._reduction, self._num_lengths = reduction, num_lengths
-        self._bordered: Bordered | None = None
         self._most = _most_solutions(reduction, num_lengths)
+        self._rough = self._most > 0
+        self._bordered: Bordered | None = None
 
     def step(self, system: ReducedSystem) -> Array | None:
         """Step (n,) of frames and border; None if the damped system is singular."""
@@ -47,26 +53,39 @@ class StepSolver:
         if self._reduction.kind == DENSE:
             matrix = dense_matrix(self._reduction, system)
             return solve_lower(matrix, right, self._num_lengths)
-        if self._bordered is not None:
-            found = solve_near(self._bordered, system, right, self._most)
-            if found is not None:
-                return found
-        # A factor that fails has overwritten the one before.
-        self._bordered = None
-        bordered = Bordered.of(self._reduction, system, self._num_lengths)
-        found = None if bordered is None else bordered.step(right[:, None])
-        if self._most and found is not None:
-            self._bordered = bordered
+        found = self._by_conjugate_gradients(system, right)
+        if found is None and self._rough:
+            self._bordered = self._factor(system)
+            found = self._by_conjugate_gradients(system, right)
+            self._rough = found is not None  # the damping falls: it would fail again
+        if found is None:
+            bordered = self._factor(system)
+            found = None if bordered is None else bordered.step(right[:, None])
+            self._bordered = bordered if self._most and found is not None else None
         return found
+
+    def _factor(self, system: ReducedSystem) -> Bordered | None:
+        self._bordered = None  # its numbers are overwritten
+        return Bordered.of(
+            self._reduction, system, self._num_lengths, rough=self._rough
+        )
+
+    def _by_conjugate_gradients(
+        self, system: ReducedSystem, right: Array
+    ) -> Array | None:
+        if self._bordered is None:
+            return None
+        return solve_near(self._bordered, system, right, self._most)
 
 
 def _most_solutions(reduction: Reduction, num_lengths: int) -> int:
-    """With an old factor, that together cost half of a new one."""
+    """With a factor that is not exact, that together cost half of one that is."""
     # Lengths make the system indefinite, which conjugate gradients do not solve.
     if reduction.kind != SPARSE or reduction.tree is None or num_lengths:
         return 0
     solution = NUMBER_FLOPS * 36.0 * reduction.tree.num_blocks
-    return int(0.5 * reduction.tree.cost / solution)
+    most = int(0.5 * reduction.tree.cost / solution)
+    return most if most >= WORTH_IT else 0
 
 
 def solve_near(

