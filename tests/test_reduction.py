@@ -176,6 +176,36 @@ def test_where_seven_digits_do_not_do_more_are_taken(survey, monkeypatch, worth_
     assert len(exact) == 2  # one for the first, another when the damping is far from it
 
 
+def test_threads_share_a_factor_without_changing_a_digit(survey, monkeypatch):
+    monkeypatch.setattr(nested_dissection, "SMALL", 8)
+    monkeypatch.setattr(reductions, "LONG", 0)
+    for name, value in (
+        ("FRONT_FLOPS", 0.0),
+        ("MOVE_FLOPS", 0.0),
+        ("BRANCH_SHARE", 0.3),
+    ):
+        monkeypatch.setattr(trees, name, value)  # many fronts, of few frames each
+    monkeypatch.setattr(block_cholesky, "STRIP", 12)
+    layout = layout_of(survey.truth)
+    eqs = likelihood(layout, State.from_scene(survey.truth), None)
+    reduction = analyse(layout, SPARSE)
+    tree = reduction.tree
+    assert len(tree.branches) > 2
+    assert len(tree.trunk) > 1
+    done = [*(front for branch in tree.branches for front in branch), *tree.trunk]
+    assert sorted(done) == list(range(len(tree.fronts)))
+    for front in done:  # each after its children
+        assert {*tree.fronts[front].children} <= {*done[: done.index(front)]}
+    system = schur.reduced_system(layout, reduction.graph, eqs, 1e-6)
+    right = np.random.default_rng(0).normal(size=(6 * len(tree.order), 1))
+    found = []
+    for count in (1, 2):
+        monkeypatch.setattr(threads, "_available", lambda count=count: count)
+        assert reduction.factor.factorize(system.blocks)
+        found.append(reduction.factor.solve_half(right))
+    assert np.array_equal(*found)
+
+
 def test_lengths_get_factors_of_their_own(survey):
     """They make the system indefinite."""
     layout = layout_of(survey.truth, navigation=True, num_lengths=3)

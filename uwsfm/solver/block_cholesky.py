@@ -1,11 +1,13 @@
 """Sparse Cholesky factor of 6x6 blocks, front by front, and what it tells.
 
 Multifrontal (Duff & Reid, ACM TOMS 1983): the sums are dense products of matrices, by
-BLAS. The blocks of the inverse at the places of the factor's follow from the last front
-to the first (Takahashi, Fagan & Chen 1973), without the inverse.
+BLAS. Threads take branches of the tree, then share the products of its trunk. The
+blocks of the inverse at the places of the factor's follow from the last front to the
+first (Takahashi, Fagan & Chen 1973), without the inverse.
 """
 
 from collections.abc import Callable
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +17,12 @@ from scipy.linalg import blas, lapack
 from uwsfm._jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.elimination_tree import EliminationTree, Front
+from uwsfm.solver.threads import run_chunks
 
 ROWS_AT_ONCE = 48
 """That are eliminated by a triangle, which the L1 cache holds."""
+STRIP = 96
+"""Columns of a product's strips."""
 
 
 class Panel(NamedTuple):
@@ -45,8 +50,8 @@ def _place_blocks(blocks, slots, where, own, rest):
 
 
 @kernel
-def _add_to_pivots(update, places, own, rest):
-    """Add what a child left of the pivots' rows, to the upper triangle of a front."""
+def _take_from_pivots(update, places, own, rest):
+    """Subtract what a child left, from the pivots' rows of the upper triangle."""
     k = len(own)
     for i in range(len(places)):
         row = 6 * places[i]
@@ -58,14 +63,14 @@ def _add_to_pivots(update, places, own, rest):
                 for b in range(6):
                     value = update[6 * i + a, 6 * j + b]
                     if col < k:
-                        own[row + a, col + b] += value
+                        own[row + a, col + b] -= value
                     else:
-                        rest[row + a, col - k + b] += value
+                        rest[row + a, col - k + b] -= value
 
 
 @kernel
 def _add_to_rows(update, places, k, after):
-    """Add what a child left of the rows after k pivots, to their upper triangle."""
+    """Add what a child left of the rows after k pivots, to what its parent leaves."""
     for i in range(np.searchsorted(places, k // 6), len(places)):
         for a in range(6):
             source, target = update[6 * i + a], after[6 * places[i] - k + a]
@@ -115,9 +120,14 @@ class _Pool:
     def __init__(self, dtype: DTypeLike) -> None:
         self._dtype = dtype
         self._free: list[Array] = []
+        self._lock = Lock()
 
     def take(self, size: int) -> Array:
         """Any numbers (size, size), in the smallest array that is free."""
+        with self._lock:
+            return self._taken(size)
+
+    def _taken(self, size: int) -> Array:
         count = len(self._free)
         fitting = [k for k in range(count) if self._size(k) >= size * size]
         if fitting:
@@ -131,7 +141,8 @@ class _Pool:
     def give(self, square: Array) -> None:
         """An array of `take` that is not needed any more."""
         assert square.base is not None  # the whole of which `take` gave a part
-        self._free.append(square.base)
+        with self._lock:
+            self._free.append(square.base)
 
     def _size(self, number: int) -> int:
         return self._free[number].size
@@ -144,14 +155,23 @@ class _Functions(NamedTuple):
     trtri: Callable
     trmm: Callable
     trsm: Callable
-    syrk: Callable
 
     @classmethod
     def of(cls, dtype: DTypeLike) -> "_Functions":
         factors = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
-        return cls(
-            *factors, *blas.get_blas_funcs(("trmm", "trsm", "syrk"), dtype=dtype)
-        )
+        return cls(*factors, *blas.get_blas_funcs(("trmm", "trsm"), dtype=dtype))
+
+
+def _square(rest: Array, out: Array) -> None:
+    """Upper triangle of rest^T rest, in strips: numpy's products leave Python to other
+    threads, and scipy's syrk, no faster, does not."""
+
+    def strip(number: int) -> None:
+        first = STRIP * number
+        part = slice(first, first + STRIP)
+        np.matmul(rest[:, part].T, rest[:, first:], out=out[part, first:])
+
+    run_chunks(strip, -(-rest.shape[1] // STRIP))
 
 
 class BlockCholesky:
@@ -164,7 +184,7 @@ class BlockCholesky:
         """
         self.order = tree.order
         self._dtype = dtype
-        self._fronts = tree.fronts
+        self._tree = tree
         self._panels: list[Panel] = [
             Panel(
                 np.empty((6 * f.num_pivots, 6 * f.num_pivots), dtype),
@@ -177,32 +197,50 @@ class BlockCholesky:
         self._functions = _Functions.of(dtype)
 
     def factorize(self, blocks: Array) -> bool:
-        """Factor blocks (number of blocks, 6, 6); False if they are not positive."""
+        """Factor blocks (number of blocks, 6, 6); False if they are not positive.
+
+        Threads share the work; the digits do not depend on how many there are.
+        """
         updates: dict[int, Array] = {}
-        for number, front in enumerate(self._fronts):
-            own, rest = self._panels[number]
-            own[...], rest[...] = 0.0, 0.0
-            _place_blocks(blocks, front.slots, front.where, own, rest)
-            given = [updates.pop(child) for child in front.children]
-            for update, places in zip(given, front.maps, strict=True):
-                _add_to_pivots(update, places, own, rest)
-            if not self._eliminate(own, rest):
-                return False
-            if rest.size:
-                after = self._pool.take(rest.shape[1])
-                # Fortran reads rows as columns: our upper triangles are its lower ones.
-                # Written, then added to: nothing to zero beforehand.
-                self._functions.syrk(
-                    -1.0, rest.T, beta=0.0, c=after.T, lower=1, overwrite_c=1
-                )
-                for update, places in zip(given, front.maps, strict=True):
-                    _add_to_rows(update, places, len(own), after)
-                updates[number] = after
-            for update in given:
-                self._pool.give(update)
+        failed: list[int] = []
+
+        def eliminate(number: int) -> None:
+            if not failed and not self._eliminate_front(number, blocks, updates):
+                failed.append(number)
+
+        def branch(number: int) -> None:
+            for front in self._tree.branches[number]:
+                eliminate(front)
+
+        run_chunks(branch, len(self._tree.branches))
+        for number in self._tree.trunk:
+            eliminate(number)
         # The last pivot of a front, after which any other NaN comes; below the diagonal
         # is what the pool's arrays held.
-        return bool(np.isfinite([p.own[-1, -1] for p in self._panels]).all())
+        pivots = [panel.own[-1, -1] for panel in self._panels]
+        return not failed and bool(np.isfinite(pivots).all())
+
+    def _eliminate_front(
+        self, number: int, blocks: Array, updates: dict[int, Array]
+    ) -> bool:
+        """Its panel, from the updates that its children left, and its own update."""
+        front, (own, rest) = self._tree.fronts[number], self._panels[number]
+        own[...], rest[...] = 0.0, 0.0
+        _place_blocks(blocks, front.slots, front.where, own, rest)
+        given = [updates.pop(child) for child in front.children]
+        for update, places in zip(given, front.maps, strict=True):
+            _take_from_pivots(update, places, own, rest)
+        if not self._eliminate(own, rest):
+            return False
+        if rest.size:
+            after = self._pool.take(rest.shape[1])
+            _square(rest, after)
+            for update, places in zip(given, front.maps, strict=True):
+                _add_to_rows(update, places, len(own), after)
+            updates[number] = after
+        for update in given:
+            self._pool.give(update)
+        return True
 
     def _eliminate(self, own: Array, rest: Array) -> bool:
         """Rows of L^T in place, a few at a time: most of it products of matrices. The
@@ -240,7 +278,7 @@ class BlockCholesky:
         """L^-1 times columns (6 n, r) in the factor's order."""
         out = right.astype(self._dtype)
         for front, panel, rows in zip(
-            self._fronts, self._panels, self._rows, strict=True
+            self._tree.fronts, self._panels, self._rows, strict=True
         ):
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
             self._functions.trsm(
@@ -254,7 +292,7 @@ class BlockCholesky:
         """L^-T times columns (6 n, r)."""
         out = right.astype(self._dtype)
         for front, panel, rows in zip(
-            self._fronts[::-1], self._panels[::-1], self._rows[::-1], strict=True
+            self._tree.fronts[::-1], self._panels[::-1], self._rows[::-1], strict=True
         ):
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
             if len(rows):
@@ -267,8 +305,8 @@ class BlockCholesky:
     def inverse_blocks(self, blocks: Array) -> None:
         """Write the blocks of A^-1 in the pattern of those of A."""
         known: dict[int, Array] = {}
-        for number in range(len(self._fronts) - 1, -1, -1):
-            front = self._fronts[number]
+        for number in range(len(self._tree.fronts) - 1, -1, -1):
+            front = self._tree.fronts[number]
             own, rest = self._panels[number]
             after = known.pop(number, np.empty((0, 0)))
             root, _ = self._functions.trtri(own.T, lower=1)

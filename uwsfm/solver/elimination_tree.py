@@ -19,6 +19,9 @@ from uwsfm.solver.block_graph import BlockGraph
 
 FRONT_FLOPS = 1e6
 """What a front costs beside its sums: 50 us of Python."""
+BRANCH_SHARE = 1.0 / 8.0
+"""Of all sums, the most that one branch has: where many frames are left, eight threads
+have one each, and two or four end at about the same time."""
 MOVE_FLOPS = 20.0
 """What moving a number of a front costs."""
 
@@ -52,6 +55,11 @@ class EliminationTree:
     """Of a factor, in flops of a large product."""
     num_blocks: int
     """6x6 blocks of the factor."""
+    branches: tuple[tuple[int, ...], ...]
+    """Fronts of subtrees that threads may eliminate side by side, the costliest first;
+    the same for any number of threads."""
+    trunk: tuple[int, ...]
+    """The other fronts."""
 
 
 def adjacency(graph: BlockGraph, keep: IndexArray) -> sp.csr_array:
@@ -141,12 +149,36 @@ def elimination_tree(
         -1, 2
     )
     pivots, rows = sizes.T
+    costs = _cost(pivots, rows)
+    branches, trunk = _branches(fronts, costs)
     return EliminationTree(
         order=keep[order][new_order],
         fronts=tuple(fronts),
-        cost=float(np.sum(_cost(pivots, rows))),
+        cost=float(np.sum(costs)),
         num_blocks=int(np.sum(pivots * (pivots + 1) / 2 + pivots * rows)),
+        branches=branches,
+        trunk=trunk,
     )
+
+
+def _branches(
+    fronts: list[Front], costs: Array
+) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
+    """The largest subtrees that cost no more than their share, and the rest."""
+    below, members = costs.copy(), [[number] for number in range(len(fronts))]
+    for number, front in enumerate(fronts):
+        for child in front.children:
+            below[number] += below[child]
+    limit = BRANCH_SHARE * np.sum(costs)
+    small = below <= limit
+    trunk = [number for number in range(len(fronts)) if not small[number]]
+    for number, front in enumerate(fronts):
+        if small[number]:
+            for child in front.children:
+                members[number] = members[child] + members[number]
+    inner = {c for f, one in zip(fronts, small, strict=True) if one for c in f.children}
+    roots = [n for n in np.argsort(-below) if small[n] and n not in inner]
+    return tuple(tuple(sorted(members[n])) for n in roots), tuple(trunk)
 
 
 def _touched(pattern: sp.csr_array, order: IndexArray) -> list[IndexArray]:
