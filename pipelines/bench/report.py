@@ -116,25 +116,26 @@ def _solver(results: Results) -> str:
                 f"{1e3 * one['setup_s']:.0f}",
                 f"{1e3 * single['cpu_s']:.1f}",
                 f"{single['cpu_us_per_observation']:.3f}",
+                f"{single['iterations'] * single['cpu_s']:.2f}",
                 *(f"{1e3 * single['stages_cpu_s'][s]:.1f}" for s in SOLVER_STAGES),
                 f"{one['peak_mb']:.0f} ({one['peak_before_mb']:.0f})",
             ]
         )
+        whole = single["wall_s"] / double["wall_s"]
         ratios = [
-            single["stages_wall_s"][s] / double["stages_wall_s"][s]
+            _ratio(single["stages_wall_s"][s], double["stages_wall_s"][s])
             for s in SOLVER_STAGES
         ]
-        whole = single["wall_s"] / double["wall_s"]
-        speed.append([f"{one['frames']}", *(f"{r:.2f}" for r in (whole, *ratios))])
+        speed.append([f"{one['frames']}", f"{whole:.2f}", *ratios])
     header = ["frames", "points", "observations", "iterations", "set-up"]
-    header += ["iteration", "us/observation"]
+    header += ["iteration", "us/observation", "all, s"]
     said = sorted({line for one in sizes for line in one["log"]})
     return "\n\n".join(
         [
             "## Solver",
             "CPU milliseconds on one core: of the set-up (observations sorted, "
-            "structure found), and of one iteration, whole and by stage; peak memory "
-            "of the process in MB (and before the solve).",
+            "structure found), and of one iteration, whole and by stage; seconds of "
+            "all; peak memory of the process in MB (and before the solve).",
             table([*header, *SOLVER_STAGES, "MB"], lines),
             *(["The solver's own words: " + "; ".join(said) + "."] if said else []),
             "![time per observation](solver.png) ![memory](memory.png)",
@@ -142,6 +143,10 @@ def _solver(results: Results) -> str:
             table(["frames", "whole", *SOLVER_STAGES], speed),
         ]
     )
+
+
+def _ratio(one: float, two: float) -> str:
+    return f"{one / two:.2f}" if two > 0.0 else "-"
 
 
 def _peers(results: Results) -> str:
