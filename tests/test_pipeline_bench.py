@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 FOLDER = Path(__file__).parent.parent / "pipelines" / "bench"
-STAGES = 6  # of an iteration of the solver
+STAGES = 7  # of an iteration of the solver
 
 
 def numbers(value):
