@@ -72,6 +72,9 @@ def test_a_limit_on_what_a_cloud_lacks_is_refused(tmp_path: Path, rng):
     table = np.rec.fromarrays(cloud.points.T, names="x,y,z")
     with pytest.raises(InputError, match="holds no reprojection error"):
         clean_points(table, CleanOptions(max_error_px=1.0))
+    table = np.rec.fromarrays([*cloud.points.T, cloud.stddev], names="x,y,z,stddev")
+    with pytest.raises(InputError, match=r"no range.*leave --max-relative-stddev out"):
+        clean_points(table, CleanOptions(max_stddev_m=1.0, max_relative_stddev=1.0))
     with pytest.raises(InputError, match="max_error_px must be positive"):
         CleanOptions(max_error_px=-1.0)
     write_cloud(cloud, tmp_path / "cloud.ply")

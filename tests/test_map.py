@@ -1,6 +1,7 @@
 """Maps: a relief comes back at its place, not mirrored, with its holes."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from uwsfm._ply import read_vertices, write_ply
 from uwsfm.cli import app
-from uwsfm.cloud import UNKNOWN_UNIT, Cloud, write_cloud
+from uwsfm.cloud import UNKNOWN_UNIT, Cloud, read_cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.export.files import export_colmap, export_ply, unit_of_model
 from uwsfm.export.housing import export_housing
@@ -181,11 +182,23 @@ def test_points_of_a_result_are_cleaned_exported_and_mapped(tmp_path: Path):
     assert [item["name"] for item in report["filters"]][
         3
     ] == "standard deviation / range"
+    # What is known of the points stays known of those that were kept.
+    kept, given = read_cloud(good), find_source(out).cloud()
+    np.testing.assert_allclose(kept.stddev, 1e-3, rtol=1e-6)  # single precision
+    assert set(kept.num_views) <= set(given.num_views) - {1}
+    assert set(kept.view_range) <= set(given.view_range)
+    stricter = tmp_path / "stricter.ply"
+    middle = np.median(kept.stddev / kept.view_range)
+    run("clean", good, "-o", stricter, "--max-relative-stddev", middle)
+    assert len(read_cloud(stricter)) < len(kept)
     said = run("export", good, "-o", tmp_path / "good.laz", "--to", "laz")
     assert f"{report['num_kept']} points" in said
     assert "scale of this reconstruction is arbitrary" in " ".join(said.split())
-    said = run("map", out, "-o", tmp_path / "map")
+    shutil.copy(good, out)  # in its folder, whose cameras tell which side is up
+    said = run("map", out / "good.ply", "-o", tmp_path / "map")
     assert "scale of this reconstruction is arbitrary" in " ".join(said.split())
+    percentiles = json.loads((tmp_path / "map" / "map.json").read_text())
+    assert percentiles["point_stddev_percentiles"]["50"] == pytest.approx(1e-3)
     # The world's z points down: cameras are above, so the map is turned over.
     pose = json.loads((tmp_path / "map" / "map.json").read_text())["world_from_map"]
     up = rigid3.rotate(np.array(pose["rotation_xyzw"] + [0, 0, 0]), np.eye(3)[2:])[0]

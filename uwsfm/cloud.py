@@ -20,6 +20,11 @@ _COLUMNS = (
     ("num_views", "<i4"),
     ("view_range", "<f4"),
 )
+STDDEV_NAMES = ("stddev", "depth_stddev_m")
+"""Properties that hold standard deviations along the line of sight: of dense clouds,
+and of the points of an adjustment."""
+VIEWS_NAMES = ("num_views", "track_length")
+"""Properties that hold how many views agree on a point, likewise."""
 _UNIT = "unit: "
 UNKNOWN_UNIT = "unknown unit"
 """Of lengths that nobody tells the unit of."""
@@ -42,10 +47,10 @@ class Cloud:
     stddev: Array
     """(N,) along the line of sight, metres; NaN if undetermined."""
     num_views: NDArray[np.int64]
-    """(N,) depth maps that agree on the point."""
+    """(N,) depth maps that agree on the point; of an adjustment, images that see it."""
     view_range: Array
-    """(N,) distance from the camera that gives the colour, through the water; NaN if
-    unknown."""
+    """(N,) distance from the camera that gives the colour, through the water, or the
+    mean over the images of a point of an adjustment; NaN if unknown."""
 
     def __post_init__(self) -> None:
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
@@ -86,31 +91,54 @@ def write_cloud(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
 
 
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a file of `write_cloud`, or the vertices of any binary PLY.
+    """Read a file of `write_cloud`, points of an adjustment, or any binary PLY.
 
     What the file does not hold is NaN; colours are then grey, views one.
 
     Raises:
         InputError: the file is not there, no such PLY, or without x, y and z.
     """
+    return cloud_of_table(read_table(path))
+
+
+def read_table(path: str | Path) -> np.ndarray:
+    """All columns of the vertices of a cloud's file, a structured array (N,).
+
+    Raises:
+        InputError: as `read_cloud`.
+    """
     table, _ = read_vertices(Path(path))
-    names = table.dtype.names or ()
-    if not {"x", "y", "z"} <= set(names):
+    if not {"x", "y", "z"} <= set(table.dtype.names or ()):
         raise InputError(f"{path}: its vertices have no x, y and z")
+    return table
+
+
+def cloud_of_table(table: np.ndarray) -> Cloud:
+    """The cloud of what `read_table` returns."""
 
     def columns(wanted: tuple[str, ...], default: float) -> np.ndarray:
-        if not set(wanted) <= set(names):
+        if not set(wanted) <= set(table.dtype.names or ()):
             return np.full((len(table), len(wanted)), default)
         return np.stack([table[name] for name in wanted], axis=1)
+
+    def column(names: tuple[str, ...], default: float) -> np.ndarray:
+        found = column_of(table, names)
+        return np.full(len(table), default) if found is None else found
 
     return Cloud(
         points=columns(("x", "y", "z"), np.nan).astype(np.float64),
         normals=columns(("nx", "ny", "nz"), np.nan).astype(np.float64),
         colors=columns(("red", "green", "blue"), 128).astype(np.uint8),
-        stddev=columns(("stddev",), np.nan)[:, 0].astype(np.float64),
-        num_views=columns(("num_views",), 1)[:, 0].astype(np.int64),
-        view_range=columns(("view_range",), np.nan)[:, 0].astype(np.float64),
+        stddev=column(STDDEV_NAMES, np.nan).astype(np.float64),
+        num_views=column(VIEWS_NAMES, 1).astype(np.int64),
+        view_range=column(("view_range",), np.nan).astype(np.float64),
     )
+
+
+def column_of(table: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
+    """The first of these columns (N,) that a table has; None if it has none."""
+    found = next((name for name in names if name in (table.dtype.names or ())), None)
+    return None if found is None else table[found]
 
 
 def unit_of_cloud(path: str | Path) -> str:

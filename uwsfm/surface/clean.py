@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from uwsfm.cloud import STDDEV_NAMES, VIEWS_NAMES, column_of
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
-_VIEWS = ("num_views", "track_length")
-_STDDEV = ("stddev", "depth_stddev_m")
+_RANGE = ("view_range",)
 _ERROR = ("reprojection_error_px",)
 # A normal distribution's standard deviation over its median absolute deviation.
 _MAD_TO_STDDEV = 1.4826
@@ -58,23 +58,24 @@ class Filter:
     """Tested points whose value is not determined; they are removed."""
 
 
-def default_options(table: np.ndarray, ranges: Array | None = None) -> CleanOptions:
+def default_options(table: np.ndarray) -> CleanOptions:
     """Limits on what a cloud holds, and on nothing else; as in `clean_points`.
 
     Two views of a track always meet somewhere near: three are a check. Depth maps were
     checked against each other before they were fused.
     """
     names = set(table.dtype.names or ())
-    known_range = ranges is not None or "view_range" in names
     return CleanOptions(
         min_views=3 if "track_length" in names else 2 if "num_views" in names else None,
         max_error_px=2.0 if set(_ERROR) & names else None,
-        max_relative_stddev=0.02 if set(_STDDEV) & names and known_range else None,
+        max_relative_stddev=(
+            0.02 if set(STDDEV_NAMES) & names and set(_RANGE) & names else None
+        ),
     )
 
 
 def clean_points(
-    table: np.ndarray, options: CleanOptions, ranges: Array | None = None
+    table: np.ndarray, options: CleanOptions
 ) -> tuple[NDArray[np.bool_], list[Filter]]:
     """Which points of a cloud are good.
 
@@ -82,7 +83,6 @@ def clean_points(
         table: (N,) vertices of a PLY, with x, y, z and any of num_views or
             track_length, reprojection_error_px, stddev or depth_stddev_m, view_range.
         options: the limits.
-        ranges: (N,) distances through the water where the table has no view_range.
 
     Returns:
         A mask (N,), and what each filter removed, in their order.
@@ -109,9 +109,9 @@ def clean_points(
 
     apply("position is finite", None, np.isfinite(xyz).all(axis=1))
     if options.min_views is not None:
-        views = _column(table, _VIEWS, "number of views")
+        views = _column(table, VIEWS_NAMES, "number of views", "min-views")
         apply("views", options.min_views, views >= options.min_views)
-    for name, limit, values in _upper_limits(table, options, ranges):
+    for name, limit, values in _upper_limits(table, options):
         apply(name, limit, values <= limit, np.isfinite(values))
     if options.outlier_ratio is not None:
         stray = np.zeros(len(table), dtype=bool)
@@ -122,18 +122,20 @@ def clean_points(
 
 
 def _upper_limits(
-    table: np.ndarray, options: CleanOptions, ranges: Array | None
+    table: np.ndarray, options: CleanOptions
 ) -> Iterator[tuple[str, float, Array]]:
     """Name, limit and values (N,) of the filters that are asked for."""
     if options.max_error_px is not None:
-        errors = _column(table, _ERROR, "reprojection error")
+        errors = _column(table, _ERROR, "reprojection error", "max-error-px")
         yield "reprojection error (px)", options.max_error_px, errors
     if options.max_stddev_m is not None:
-        stddev = _column(table, _STDDEV, "standard deviation")
+        stddev = _column(table, STDDEV_NAMES, "standard deviation", "max-stddev")
         yield "standard deviation (m)", options.max_stddev_m, stddev
     if options.max_relative_stddev is not None:
-        stddev = _column(table, _STDDEV, "standard deviation")
-        share = stddev / _ranges(table, ranges)
+        stddev = _column(
+            table, STDDEV_NAMES, "standard deviation", "max-relative-stddev"
+        )
+        share = stddev / _column(table, _RANGE, "range", "max-relative-stddev")
         yield "standard deviation / range", options.max_relative_stddev, share
 
 
@@ -159,22 +161,11 @@ def _mask(values: ArrayLike) -> NDArray[np.bool_]:
     return np.asarray(values, dtype=bool)
 
 
-def _column(table: np.ndarray, names: tuple[str, ...], what: str) -> Array:
-    for name in names:
-        if name in (table.dtype.names or ()):
-            return table[name].astype(np.float64)
-    raise InputError(
-        f"this cloud holds no {what} (property {' or '.join(names)}): "
-        "leave that limit out"
-    )
-
-
-def _ranges(table: np.ndarray, ranges: Array | None) -> Array:
-    if "view_range" in (table.dtype.names or ()):
-        return table["view_range"].astype(np.float64)
-    if ranges is None:
+def _column(table: np.ndarray, names: tuple[str, ...], what: str, limit: str) -> Array:
+    found = column_of(table, names)
+    if found is None:
         raise InputError(
-            "this cloud holds no range (property view_range), and no model lies "
-            "beside it: give --max-stddev instead of --max-relative-stddev"
+            f"this cloud holds no {what} (property {' or '.join(names)}): "
+            f"leave --{limit} out"
         )
-    return ranges
+    return found.astype(np.float64)

@@ -32,7 +32,8 @@ from uwsfm.surface.units import length_words
 def clean_cloud(
     source: str | Path, path: str | Path, **limits: float
 ) -> dict[str, Any]:
-    """Write the good points of a cloud, all their columns kept.
+    """Write the good points of a cloud, all their columns kept; of the points of an
+    adjustment also their ranges, which only the model beside them tells.
 
     A JSON file of the same name holds what each filter removed.
 
@@ -55,15 +56,11 @@ def clean_cloud(
     report_path = checked_target(target.with_suffix(".json"))
     found = find_source(source)
     table = found.table()
-    wants_range = limits.get("max_relative_stddev") != math.inf
-    ranges = None
-    if found.is_sparse and wants_range:
-        ranges = found.sparse_ranges(len(table))
     wanted: dict[str, Any] = {
         name: None if value == math.inf else value for name, value in limits.items()
     }
-    options = replace(default_options(table, ranges), **wanted)
-    keep, filters = clean_points(table, options, ranges)
+    options = replace(default_options(table), **wanted)
+    keep, filters = clean_points(table, options)
     if not np.any(keep):
         worst = max(filters, key=lambda item: item.num_removed)
         raise InputError(

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import append_fields
 
-from uwsfm._ply import read_vertices
-from uwsfm.cloud import UNKNOWN_UNIT, Cloud, read_cloud, unit_of_cloud
+from uwsfm.cloud import UNKNOWN_UNIT, Cloud, cloud_of_table, read_table, unit_of_cloud
 from uwsfm.errors import InputError
 from uwsfm.export.files import (
     POINTS,
@@ -55,29 +55,24 @@ class Source:
         return fingerprint_of(self.folder)
 
     def table(self) -> np.ndarray:
-        """All columns of its vertices, a structured array (N,)."""
-        return read_vertices(self.path)[0]
+        """All columns of its vertices, a structured array (N,); of the points of the
+        adjustment their ranges too, as view_range.
+
+        Raises:
+            InputError: the file cannot be read, has no x, y and z, or has other points
+                than the model beside it.
+        """
+        table = read_table(self.path)
+        if not self.is_sparse:
+            return table
+        ranges = self._sparse_ranges(len(table)).astype(np.float32)
+        return append_fields(table, "view_range", ranges, usemask=False)
 
     def cloud(self) -> Cloud:
-        """Its points; of sparse ones, ranges and standard deviations as a cloud's."""
-        cloud = read_cloud(self.path)
-        if not self.is_sparse:
-            return cloud
-        table = self.table()
-        names = table.dtype.names or ()
-        stddev = cloud.stddev
-        if "depth_stddev_m" in names:
-            stddev = table["depth_stddev_m"].astype(np.float64)
-        return Cloud(
-            points=cloud.points,
-            normals=cloud.normals,
-            colors=cloud.colors,
-            stddev=stddev,
-            num_views=table["track_length"].astype(np.int64),
-            view_range=self.sparse_ranges(len(cloud)),
-        )
+        """Its points, and what `table` holds of each."""
+        return cloud_of_table(self.table())
 
-    def sparse_ranges(self, count: int) -> Array:
+    def _sparse_ranges(self, count: int) -> Array:
         """Mean length of the water rays to the points of the adjustment (P,).
 
         Raises:
