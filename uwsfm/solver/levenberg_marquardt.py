@@ -35,9 +35,12 @@ from uwsfm.solver.workspace import Workspace
 # Two BLAS threads cost 200x on a small Cholesky when the cores are busy.
 SINGLE_BLAS_BELOW = 1500
 
+FASTEST_FALL = 0.01
+"""Of the damping, where a step keeps what it promised: the bends of long transects want
+a ten-thousandth of what a start needs."""
+
 FALLS_SHORT = 0.75
-"""Of the predicted decrease; a step below it is tried with settled points, too. Above,
-the damping falls nearly as fast as it may."""
+"""Of the predicted decrease; a step below it is tried with settled points, too."""
 
 
 class Stop(Enum):
@@ -251,7 +254,7 @@ def minimize(
     """Minimise a robust error from a start.
 
     Marquardt scaling by max(diagonal, 1e-6); the damping falls by
-    max(1/10, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure. A
+    max(1/100, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure. A
     step that falls short is tried with settled points, too: `uwsfm.solver.settling`.
 
     Raises:
@@ -298,7 +301,7 @@ def _iterate(
         if decrease > 0.0:
             relative, gain = decrease / cost, decrease / max(predicted, 1e-300)
             state, cost = trial, trial_cost
-            damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
+            damping *= max(FASTEST_FALL, 1.0 - (2.0 * gain - 1.0) ** 3)
             growth = 2.0
             if relative < options.min_relative_decrease:
                 stop = Stop.CONVERGED
