@@ -1,13 +1,15 @@
 """Every command, and the sentences in which its mistakes end."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from filelock import FileLock
@@ -221,13 +223,33 @@ def test_calibrate_names_the_mistake(tmp_path, options, words):
     assert {path.name for path in tmp_path.iterdir()} == {"rig.yaml"}
 
 
-def test_simulate_observations_calibrate_back(tmp_path):
-    """The file holds all that `Scene.from_arrays` takes, and the truth."""
+def test_simulated_observations_calibrate_back_as_the_readme_says(
+    tmp_path, monkeypatch
+):
     found = run("simulate", "observations", "-o", "dive.npz", cwd=tmp_path)
     assert found.returncode == 0, found.stderr
-    with np.load(tmp_path / "dive.npz") as data:
-        assert data["xy"].shape == (len(data["point_idx"]), 2)
-        assert len(data["xy"]) > 1000
+    monkeypatch.chdir(tmp_path)
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    blocks = re.split(r"\n(?=\S)", readme)
+    (example,) = (
+        textwrap.dedent(b[b.index("\n") :]) for b in blocks if "perturbed" in b
+    )
+    names: dict[str, Any] = {}
+    exec(example, names)
+    scene, truth = names["found"].scene, names["dive"].truth
+    cameras = names["found"].covariance.cameras
+    for port, true, known in zip(scene.ports, truth.ports, cameras, strict=True):
+        miss = abs(port.distance - true.distance)
+        assert 0.0 < miss < 4.0 * known.distance_stddev_m < 0.01  # started 10 mm off
+    _one_sentence(
+        run("simulate", "observations", "-o", "dive.npz", cwd=tmp_path),
+        "dive.npz exists already",
+    )
+    run("init", "rig.yaml", cwd=tmp_path)
+    _one_sentence(
+        run("calibrate", "rig.yaml", "dive.npz", "-o", "out", cwd=tmp_path),
+        "uwsfm.simulate.read_observations('dive.npz')",
+    )
     _one_sentence(
         run("simulate", "observations", "-o", "dive.txt", cwd=tmp_path), ".npz"
     )

@@ -165,6 +165,8 @@ def test_wrong_observation_options_are_refused(tmp_path):
         simulate_observations(tmp_path / "dive.npz", trajectory="circle")
     with pytest.raises(InputError, match="positive altitude"):
         simulate_observations(tmp_path / "dive.npz", altitude=-1.0)
+    with pytest.raises(InputError, match="at least two frames"):
+        simulate_observations(tmp_path / "dive.npz", num_frames=1)
     with pytest.raises(InputError, match=r"nothing\.npz"):
         read_observations(tmp_path / "nothing.npz")
 

@@ -56,18 +56,28 @@ def simulate_observations(
     trajectory: Annotated[
         Literal["rich", "strip", "lawn-mower"], typer.Option(help="How the rig moves.")
     ] = "rich",
-    frames: Annotated[int, typer.Option(help="Stereo pairs.")] = 15,
+    frames: Annotated[int, typer.Option(min=2, help="Stereo pairs.")] = 15,
     altitude_m: Annotated[float, typer.Option(help="Mean height above ground.")] = 2.0,
-    relief_m: Annotated[float, typer.Option(help="Its standard deviation.")] = 0.2,
-    points: Annotated[int, typer.Option(help="Seen at least twice.")] = 800,
-    noise_px: Annotated[float, typer.Option(help="Per image coordinate.")] = 0.5,
-    outliers: Annotated[float, typer.Option(help="Share of the observations.")] = 0.0,
+    relief_m: Annotated[
+        float, typer.Option(min=0, help="Its standard deviation.")
+    ] = 0.2,
+    points: Annotated[int, typer.Option(min=1, help="Seen at least twice.")] = 800,
+    noise_px: Annotated[float, typer.Option(min=0, help="Per image coordinate.")] = 0.5,
+    outliers: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the observations.")
+    ] = 0.0,
     distance_m: Annotated[float, typer.Option(help="Of both ports.")] = 0.02,
     thickness_m: Annotated[float, typer.Option(help="Of both glasses.")] = 0.005,
     focal_px: Annotated[float, typer.Option(help="Of both cameras.")] = 1000.0,
     seed: Annotated[int, typer.Option(help="Of floor, points and noise.")] = 0,
 ) -> None:
-    """Simulate what a stereo rig observes, with ground truth, as arrays."""
+    """Simulate what a stereo rig observes, with ground truth, as arrays.
+
+    Observations: xy, camera_idx, frame_idx, point_idx. Truth: true_xy, is_outlier,
+    points, rig_from_world, cam_from_rig, port_rows; the lenses are camera_model,
+    camera_size and camera_params. uwsfm.simulate.read_observations makes a Scene of
+    them, for uwsfm.calibrate in Python: see the README.
+    """
     from uwsfm.simulate.commands import simulate_observations as run
 
     simulated = run(

@@ -111,6 +111,12 @@ def calibrate_housing(
     require_effect(CalibrateOptions.parsed(merged))
     known = KnownLengths.read(lengths, positions, lever_arm)
     source, out = Path(source), output_folder(out)
+    if source.suffix == ".npz" and source.is_file():
+        raise InputError(
+            f"{source} holds arrays, and neither images nor a model: observations are "
+            "calibrated in Python, uwsfm.calibrate(scene), with the scene of "
+            f"uwsfm.simulate.read_observations({source.name!r})"
+        )
     if (out / SPARSE).exists():
         raise InputError(
             f"{out} holds a reconstruction, whose housing this would replace: choose "

@@ -1,5 +1,6 @@
 """Synthetic dives with known truth: observations, and rendered images."""
 
+from uwsfm.simulate.observation_file import read_observations, write_observations
 from uwsfm.simulate.observations import (
     ObservationOptions,
     SimulatedScene,
@@ -16,6 +17,8 @@ __all__ = [
     "SimulatedScene",
     "SurveySpec",
     "perturbed",
+    "read_observations",
     "simulate_scene",
     "simulate_survey",
+    "write_observations",
 ]

@@ -7,6 +7,7 @@ import numpy as np
 
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
+from uwsfm.export.files import checked_target
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.observation_file import write_observations
 from uwsfm.simulate.observations import (
@@ -91,9 +92,10 @@ def simulate_observations(
     """Simulate what the stereo rig of Sedlazeck & Koch (2011) would observe.
 
     Args:
-        path: The .npz file to write; see `uwsfm.simulate.observation_file.ARRAYS`.
+        path: The .npz file to write; must not exist. See
+            `uwsfm.simulate.observation_file.ARRAYS`.
         trajectory: One of `TRAJECTORIES`.
-        num_frames: Stereo pairs.
+        num_frames: Stereo pairs, at least two.
         altitude: Mean height above the floor, metres.
         relief: Standard deviation of the floor's depth, metres; 0 is flat.
         num_points: Points seen at least twice.
@@ -106,11 +108,13 @@ def simulate_observations(
         seed: Of the floor, the points and the noise.
 
     Raises:
-        InputError: an unknown trajectory or a value out of range.
+        InputError: an unknown trajectory, a value out of range, or something to write
+            over.
         UwsfmError: the rig does not see enough of the floor.
     """
     if not str(path).endswith(".npz"):
         raise InputError(f"{path}: the name of an observation file must end in .npz")
+    target = checked_target(path)
     simulated = simulate_scene(
         paper_rig(thickness=thickness, focal_px=focal_px, distance=distance),
         _trajectory(trajectory, num_frames, altitude),
@@ -123,15 +127,15 @@ def simulate_observations(
             seed=seed,
         ),
     )
-    write_observations(simulated, Path(path))
+    write_observations(simulated, target)
     return simulated
 
 
 def _trajectory(name: str, num_frames: int, altitude: float) -> Array:
     """Poses (num_frames, 7), neighbours overlapping by about 80 % at any altitude."""
-    if num_frames < 1 or not altitude > 0.0:
+    if num_frames < 2 or not altitude > 0.0:
         raise InputError(
-            "a trajectory needs at least one frame and a positive altitude, "
+            "a trajectory needs at least two frames and a positive altitude, "
             f"got {num_frames} and {altitude}"
         )
     if name == "rich":
