@@ -279,7 +279,10 @@ class Covariance:
     border_cols: IndexArray
     """(C, BORDER_SIZE) column of each parameter of each camera, -1 if held."""
     frames: Array
-    """(F, 6, 6) of rig_from_world [rotation, translation]; zero for the held first."""
+    """(F, 6, 6) of rig_from_world, left tangents [w (radians), v (metres)] as of
+    `uwsfm.geometry.rigid3.perturb`, which make x -> Exp(w) (R x + t) + v of the
+    estimate (R, t): v is t' - Exp(w) t, no difference of translations, and the rig's
+    centre moves by -R^T v. Zero for the held first."""
     points: Array
     """(P, 3, 3) in the world, relative to the held first frame; NaN if undetermined."""
     cameras: tuple[CameraCovariance, ...]

@@ -6,7 +6,8 @@ fingerprint), the covariances (``border``, ``border_cols``, ``frames``, ``points
 ``determined``, ``scale_stddev``), standard deviations of the cameras
 (``camera_stddevs``, ``distance_at_zero``), and, where they were given, what was known
 of lengths and positions (``entered.*``, ``bars.*``) and how it fits (``lengths.*``,
-``positions.*``).
+``positions.*``). ``frames`` is of left tangents [rotation, translation] of
+rig_from_world, see `Covariance.frames`.
 """
 
 import dataclasses

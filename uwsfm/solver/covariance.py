@@ -63,7 +63,7 @@ class ReducedCovariance:
 
     @property
     def frames(self) -> Array:
-        """(F, 6, 6) blocks of the poses [rotation, translation]; zero if held."""
+        """(F, 6, 6) blocks of the poses, tangents of `rigid3.perturb`; zero if held."""
         graph = self.reduction.graph
         blocks = np.zeros((len(self.layout.frame_col), 6, 6))
         blocks[graph.frame] = self.blocks[graph.row_start[1:] - 1]
