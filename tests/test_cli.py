@@ -295,7 +295,7 @@ def test_init_says_of_which_cameras_a_model_has_no_port(tmp_path):
     assert data["water"] == {"refractive_index": 1.333}
     (tmp_path / "cameras.txt").rename(tmp_path / "cameras.bin")
     found = run("init", "again.yaml", "--from", ".", cwd=tmp_path)
-    _one_sentence(found, "cameras.txt: no such file, only cameras.bin: ports are in")
+    _one_sentence(found, "only cameras.bin: ports are in text models that Refractive")
 
 
 @pytest.mark.parametrize(

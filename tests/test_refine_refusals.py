@@ -210,11 +210,11 @@ def test_the_distance_of_a_scene_is_not_asked_of_a_rig_with_a_baseline(
     """Also if it is the default, which the user of a stereo rig has no need to give."""
     source = plain if job != "reconstruct" else tmp_path
     inputs = (source, dive.rig) if job == "refine_model" else (dive.rig, source)
-    words = "scene_distance_m has no effect: the baseline of the rig gives the scale"
+    words = r"^--scene-distance \(scene_distance_m\) has no effect: the baseline of the"
     with pytest.raises(uwsfm.InputError, match=words):
         getattr(uwsfm, job)(*inputs, tmp_path / "out", scene_distance_m=1.0)
     assert not (tmp_path / "out").exists()
     alone = replace(dive.rig, cameras=dive.rig.cameras[:1], baseline_m=None)
     inputs = (source, alone) if job == "refine_model" else (alone, source)
-    with pytest.raises(uwsfm.InputError, match="scene_distance_m must be positive"):
+    with pytest.raises(uwsfm.InputError, match=r"^--scene-distance.* must be positive"):
         getattr(uwsfm, job)(*inputs, tmp_path / "out", scene_distance_m=0.0)

@@ -259,11 +259,13 @@ def scene_distance(rig: Rig, given_m: float | None) -> float:
         return 1.0
     if len(rig.cameras) > 1:
         raise InputError(
-            "scene_distance_m has no effect: the baseline of the rig gives the scale; "
-            "leave this option out"
+            "--scene-distance (scene_distance_m) has no effect: the baseline of the "
+            "rig gives the scale; leave this option out"
         )
     if not 0.0 < given_m < np.inf:
-        raise InputError(f"scene_distance_m must be positive, got {given_m}")
+        raise InputError(
+            f"--scene-distance (scene_distance_m) must be positive, got {given_m}"
+        )
     return given_m
 
 

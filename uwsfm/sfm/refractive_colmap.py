@@ -70,8 +70,10 @@ def read_refractive_cameras(path: str | Path) -> dict[int, PortCamera]:
         hint = ""
         if path.with_suffix(".bin").is_file():
             hint = (
-                f", only {path.stem}.bin: ports are in text models (colmap "
-                "model_converter --output_type TXT writes one)"
+                f", only {path.stem}.bin: ports are in text models that Refractive "
+                "COLMAP wrote, and nowhere else; of an ordinary model, fill in a rig "
+                "file (uwsfm init without --from) with the lenses in air and the "
+                "ports, and give both to uwsfm refine"
             )
         raise InputError(f"{path}: no such file{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
