@@ -52,6 +52,19 @@ def require_writable(path: Path) -> None:
         raise InputError(f"cannot write {path}: {folder} is read-only")
 
 
+def checked_target(path: str | Path) -> Path:
+    """Where an export may be written: never over anything.
+
+    Raises:
+        InputError: there is something already, or nothing can be written there.
+    """
+    target = Path(path)
+    require_writable(target)
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError(f"{target} exists already: name another place with --out")
+    return target
+
+
 @contextmanager
 def replaced_dir(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``; it takes its place on success."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm._files import replaced_dir, require_writable
+from uwsfm._files import replaced_dir
 from uwsfm._ply import write_ply
 from uwsfm.cloud import UNKNOWN_UNIT
 from uwsfm.colmap import (
@@ -43,19 +43,6 @@ def read_model(folder: str | Path) -> Model:
         raise InputError(f"{folder}: no such folder")
     reconstruction = read_reconstruction(folder / SPARSE)
     return from_reconstruction(reconstruction, load_rig(folder / HOUSING))
-
-
-def checked_target(path: str | Path) -> Path:
-    """Where an export may be written: never over anything.
-
-    Raises:
-        InputError: there is something already, or nothing can be written there.
-    """
-    target = Path(path)
-    require_writable(target)
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
-        raise InputError(f"{target} exists already: name another place with --out")
-    return target
 
 
 def read_summary(folder: str | Path) -> dict[str, Any] | None:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import replaced_dir
+from uwsfm._files import checked_target, replaced_dir
 from uwsfm._progress import Progress, silent
 from uwsfm.colmap import Model, to_reconstruction
 from uwsfm.errors import InputError
-from uwsfm.export.files import checked_target
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
 from uwsfm.export.summary import write_json
 from uwsfm.export.warp import read_image, warp_image, warp_maps, write_image

@@ -4,9 +4,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from uwsfm._files import replaced_dir
+from uwsfm._files import checked_target, replaced_dir
 from uwsfm.colmap import Model, to_reconstruction
-from uwsfm.export.files import checked_target
 from uwsfm.sfm.refractive_colmap import (
     CAMERAS,
     IMAGES,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._files import checked_target
 from uwsfm._ply import write_ply
 from uwsfm.colmap import Model
-from uwsfm.export.files import checked_target
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera

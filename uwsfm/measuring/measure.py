@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from uwsfm._files import checked_target
 from uwsfm.calibration.length_verdicts import ASK_FOR_LENGTH, scale_verdict
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.errors import InputError
-from uwsfm.export.files import checked_target
 from uwsfm.export.summary import versions, write_json
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.measuring import quantities

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from uwsfm._files import checked_target
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
-from uwsfm.export.files import checked_target
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.observation_file import write_observations
 from uwsfm.simulate.observations import (

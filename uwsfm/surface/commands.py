@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import replaced_dir, replaced_file
+from uwsfm._files import checked_target, replaced_dir, replaced_file
 from uwsfm._packages import import_package
 from uwsfm._ply import write_ply
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import checked_target
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
