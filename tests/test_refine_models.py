@@ -221,6 +221,19 @@ def test_a_model_with_a_rig_is_refined_too(dive, tmp_path):
     assert result.summary["colmap_model"]["scale_m"] == pytest.approx(1.0, rel=1e-9)
 
 
+def test_the_error_of_a_refractive_model_as_a_pinhole_is_not_told(dive, tmp_path):
+    write(self_calibrated(dive.model), tmp_path / "model", old=True)
+    first, again = tmp_path / "first", tmp_path / "again"
+    before = uwsfm.refine_model(tmp_path / "model", dive.rig, first, report=False)
+    after = uwsfm.refine_model(first, first / "housing.yaml", again, report=False)
+    for name in ("mean_error_of_common_px", "median_error_px"):
+        assert before.summary["colmap_model"][name] > 0.3
+        assert after.summary["colmap_model"][name] is None
+    note = f"{first / 'sparse'} is a result of uwsfm, refractive already"
+    told = [note in " ".join(r.summary["warnings"]) for r in (before, after)]
+    assert told == [False, True]
+
+
 def test_the_command_line_refines_a_model(dive, tmp_path, capsys, monkeypatch):
     from uwsfm import cli
 

@@ -172,6 +172,12 @@ def _found(source: Path) -> FoundModel:
     return found
 
 
+def _is_result(model: Path) -> bool:
+    """Whether a COLMAP model is that of a result folder, whose ports lie beside it."""
+    beside = (HOUSING, POINTS)
+    return model.name == SPARSE and all((model.parent / n).is_file() for n in beside)
+
+
 def _same_or_inside(folder: Path, parent: Path) -> bool:
     return folder.resolve().is_relative_to(parent.resolve())
 
@@ -326,7 +332,15 @@ class _Job:
                 f"{' ...' if len(unregistered) > 10 else ''}"
             )
         both = model_idx >= 0
-        own = self.start.model.own_error_px[model_idx[both]]
+        own = _mean(self.start.model.own_error_px[model_idx[both]])
+        source, theirs = self.start.model.folder, dict(self.start.summary)
+        if _is_result(source):
+            own = theirs["median_error_px"] = None
+            notes.append(
+                f"{source} is a result of uwsfm, refractive already: its lenses lack "
+                f"the refraction that its {HOUSING} holds, and its own error as a "
+                "COLMAP model is not told, for it means nothing"
+            )
         error = model.errors_px()[both]
         return {
             "num_frames": len(names),
@@ -339,9 +353,9 @@ class _Job:
             "baseline_m": model.rig.baseline_m,
             "baseline_stddev_m": model.rig.baseline_stddev_m,
             "colmap_model": {
-                **self.start.summary,
+                **theirs,
                 "num_common_observations": int(np.count_nonzero(both)),
-                "mean_error_of_common_px": _mean(own),
+                "mean_error_of_common_px": own,
                 "refractive_error_of_common_px": _mean(error),
             },
             "warnings": notes + housing_warnings(model.rig, refined.calibration),
