@@ -25,6 +25,9 @@ from uwsfm.solver.schur import ReducedSystem
 TOLERANCE = 1e-2
 """Error of a step, relative, in the norm of the quadratic model: the model falls by
 1e-4 of its decrease less, and the next step makes up for it."""
+FAR = 20.0
+"""So many times stiffer than the factor's, a system is another one: they were 60 to 500
+times after the first steps, at most 10 where conjugate gradients ended in time."""
 NUMBER_FLOPS = 120.0
 """What a number of the factor costs in a solution, read twice from memory, in flops of
 a large product."""
@@ -112,7 +115,7 @@ def solve_near(
     for count in range(1, most + 1):
         image = product.times(direction)
         bend = float(direction @ image)
-        if not bend > 0.0:
+        if not 0.0 < bend < FAR * size:
             return None
         solution += (size / bend) * direction
         residual -= (size / bend) * image
