@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from filelock import FileLock
@@ -24,6 +25,10 @@ from uwsfm._jit import CACHE_DIR
 from uwsfm._progress import Progress, silent
 from uwsfm.geometry import rigid3
 from uwsfm.scene import Scene
+
+if TYPE_CHECKING:
+    from uwsfm.rig import Rig
+    from uwsfm.solver.layout import Layout
 
 STEP = "compiling kernels (first run only)"
 DONE = "compiled"
@@ -102,18 +107,23 @@ def _adjustment() -> None:
     """The kernels of the last adjustment, its errors and its uncertainties."""
     from uwsfm.sfm.refine import refine_scene
     from uwsfm.simulate.rigs import sample_rig
+    from uwsfm.solver.losses import L2
+    from uwsfm.solver.settling import settled
+    from uwsfm.solver.state import State
+    from uwsfm.solver.workspace import Workspace
 
-    refine_scene(_dive(), sample_rig())
+    rig, scene = sample_rig(), _dive()
+    refine_scene(scene, rig)
+    # Which only steps that fall short come to.
+    work = Workspace(_layout(rig, scene))
+    settled(work, State.from_scene(scene), L2, 1.0, 1e-6)
 
 
 def _elimination() -> None:
     """The kernels that project nothing, on a system that stands for any other."""
-    from uwsfm.calibration.problem import CalibrateOptions
-    from uwsfm.sfm.refine import rig_options
     from uwsfm.simulate.rigs import sample_rig
     from uwsfm.solver import schur
     from uwsfm.solver.covariance import point_covariances, reduced_covariance
-    from uwsfm.solver.layout import build_layout
     from uwsfm.solver.normal_equations import empty_normal_equations
 
     rig = sample_rig()
@@ -129,9 +139,7 @@ def _elimination() -> None:
         point_idx=point,
         xy=np.zeros((len(point), 2)),
     )
-    options = CalibrateOptions.parsed(rig_options(rig))
-    fixed = np.zeros(len(cameras), dtype=bool)
-    layout = build_layout(scene, options.border_columns(cameras, fixed))
+    layout = _layout(rig, scene)
     eqs = empty_normal_equations(layout)
     for blocks in (eqs.points, eqs.frames, eqs.border[None]):
         blocks[:] = np.eye(blocks.shape[-1])
@@ -139,6 +147,16 @@ def _elimination() -> None:
     point_covariances(layout, eqs, reduced)
     step = np.zeros(layout.num_frame_cols + layout.num_border_cols)
     schur.substitute_back(layout, reduced.reduction.graph, eqs, reduced.points, step)
+
+
+def _layout(rig: Rig, scene: Scene) -> Layout:
+    from uwsfm.calibration.problem import CalibrateOptions
+    from uwsfm.sfm.refine import rig_options
+    from uwsfm.solver.layout import build_layout
+
+    options = CalibrateOptions.parsed(rig_options(rig))
+    fixed = np.zeros(len(scene.cameras), dtype=bool)
+    return build_layout(scene, options.border_columns(scene.cameras, fixed))
 
 
 def _mapping() -> None:
