@@ -71,6 +71,9 @@ SELF_CALIBRATED = {
     "refine_principal_point": True,
     "refine_distortion": True,
 }
+MAX_ITERATIONS = 500
+"""A self-calibration takes a hundred and more, along a valley in which the fit hardly
+gains and the points move far: stopped early, its error would be that of the stop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +147,9 @@ def outcomes(strip: Strip) -> list[Row]:
     options = (LENS_HELD, {**LENS_HELD, **SELF_CALIBRATED}, {}, held, held)
     rows = []
     for method, start, wanted in zip(METHODS, starts, options, strict=True):
-        result = uwsfm.calibrate(start, loss="l2", **wanted)
+        result = uwsfm.calibrate(
+            start, loss="l2", max_iterations=MAX_ITERATIONS, **wanted
+        )
         rows.append(
             {
                 "altitude_m": strip.altitude,
@@ -213,6 +218,8 @@ def measured(result: uwsfm.CalibrationResult, truth: uwsfm.Scene) -> Row:
         "scale_ppm": 1e6 * (align(found, true, weights, with_scale=True).scale - 1.0),
         "bend": _bend(true, error[:, 2]),
         "rms_px": result.summary.rms_px,
+        "iterations": result.summary.num_iterations,
+        "converged": int(result.summary.converged),
     }
 
 
@@ -252,6 +259,8 @@ def summarized(rows: list[Row]) -> list[Row]:
                 if len(bends) > 1
                 else None,
                 "rms_px": float(np.mean([run["rms_px"] for run in runs])),
+                "iterations": float(np.median([run["iterations"] for run in runs])),
+                "converged": sum(run["converged"] for run in runs),
             }
         )
     return lines
@@ -267,7 +276,19 @@ TABLE = {
     "bend_mean": ("bend", "+.1e"),
     "bend_error": ("± (of the mean)", ".0e"),
     "rms_px": ("residual, px", ".3f"),
+    "iterations": ("iterations", ".0f"),
+    "converged": ("converged", "d"),
 }
+
+
+HEAD = """\
+# Strips over a sea floor
+
+`python pipelines/rsfm/strips.py -o pipelines/rsfm/results --runs {runs}`
+
+RMS over {runs} strips per case, residual their mean, iterations their median.
+
+"""
 
 
 def draw(lines: list[Row], path: Path) -> None:
@@ -319,7 +340,8 @@ def main() -> None:
     write_csv(rows, options.out / "strips.csv")
     lines = summarized(rows)
     text = markdown(lines, TABLE)
-    (options.out / "strips.md").write_text(text + "\n", encoding="utf-8")
+    head = HEAD.format(runs=options.runs)
+    (options.out / "strips.md").write_text(f"{head}{text}\n", encoding="utf-8")
     draw(lines, options.out / "strips.png")
     print(text)
 
