@@ -31,8 +31,6 @@ times after the first steps, at most 10 where conjugate gradients ended in time.
 NUMBER_FLOPS = 120.0
 """What a number of the factor costs in a solution, read twice from memory, in flops of
 a large product."""
-
-
 WORTH_IT = 3
 """Solutions, from 1500 frames or so; the factors of smaller surveys cost little."""
 
