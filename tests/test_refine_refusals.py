@@ -187,7 +187,9 @@ def test_a_model_of_undistorted_images_is_refused(dive, tmp_path, lens, words):
     found = self_calibrated(model_of(dive.rig, scene), lens=lens)
     write(found, tmp_path / "model", old=True)
     with pytest.raises(uwsfm.UwsfmError, match=words):
-        uwsfm.refine_model(tmp_path / "model", dive.rig, tmp_path / "out")
+        uwsfm.refine_model(tmp_path / "model", dive.rig, tmp_path / "deep" / "out")
+    # Told by the adjustment only, when the folder was locked.
+    assert {path.name for path in tmp_path.iterdir()} == {"model"}
 
 
 def test_a_model_is_not_overwritten_by_its_own_refinement(dive, tmp_path):

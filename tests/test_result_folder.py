@@ -9,7 +9,7 @@ import pytest
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.pipeline import output_folder
+from uwsfm.output_folder import locked, output_folder
 
 
 def assert_same(found, expected):
@@ -132,3 +132,12 @@ def test_a_foreign_calibration_is_not_overwritten(tmp_path):
     (tmp_path / "calibration.npz").write_bytes(b"of someone else")
     with pytest.raises(InputError, match=r"calibration\.npz exists and was not made"):
         output_folder(tmp_path)
+
+
+@pytest.mark.parametrize("written", ["housing.yaml", "uwsfm-work/steps.json"])
+def test_what_a_stopped_run_has_written_stays_and_is_ours(tmp_path, written):
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt), locked(out):
+        (out / written).touch()
+        raise KeyboardInterrupt
+    assert (out / written).exists() and output_folder(out) == out

@@ -1,7 +1,7 @@
 """The output folder of a run: never over what others made, one run at a time."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -45,10 +45,15 @@ def _made_by_us(out: Path) -> bool:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Keep a second run out of the folder: both would write the same database."""
+    """Keep a second run out of the folder: both would write the same database.
+
+    The folders that a run made only to lock them go when it ends with nothing in them.
+    """
+    work = out / WORK
+    made = [folder for folder in (work, *work.parents) if not folder.exists()]
     try:
-        (out / WORK).mkdir(parents=True, exist_ok=True)
-        lock = FileLock(out / WORK / LOCK)
+        work.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(work / LOCK)
         lock.acquire(timeout=0)
     except Timeout:
         raise InputError(f"another uwsfm is at work in {out}") from None
@@ -57,4 +62,14 @@ def locked(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        # Beside results the lock is the mark that they are ours.
+        bare = made and not any((out / name).exists() for name in RESULTS)
+        bare = bare and list(work.glob("*")) == [work / LOCK]
+        if bare:
+            with suppress(OSError):  # Windows: the release removes it
+                (work / LOCK).unlink()
         lock.release()
+        if bare:
+            with suppress(OSError):  # up to the first that holds something else
+                for folder in made:
+                    folder.rmdir()
