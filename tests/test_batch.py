@@ -96,6 +96,15 @@ def test_wrong_input_needs_no_workers_and_is_one_sentence_in_the_log(
     assert log[-1].endswith(f"failed: {outcome.reason}") and len(log) == 2
 
 
+def test_no_threads_at_all_are_refused(tmp_path):
+    """Local worker processes would be none, and never end."""
+    with pytest.raises(
+        InputError, match=r"^--threads \(num_threads\) must be positive"
+    ):
+        run_batch(written(tmp_path, {"version": 1, "dives": [DIVE]}), num_threads=0)
+    assert not (tmp_path / "bow").exists()
+
+
 def small_dive(folder: Path, num_frames: int, scale: float = 0.4) -> None:
     """The first frames of the sample, reduced, and their rig."""
     reduced_images(folder / "images", scale, num_frames)

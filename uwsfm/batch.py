@@ -16,7 +16,7 @@ from uwsfm.dives_file import Dive, load_dives
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.pipeline import checked_rig, output_folder, reconstruct
 from uwsfm.sfm.images import find_frames
-from uwsfm.tasks import LOCAL, Workers
+from uwsfm.tasks import LOCAL, Workers, require_threads
 
 logger = logging.getLogger(__name__)
 
@@ -58,8 +58,9 @@ def run_batch(
         on where it was when it is run again.
 
     Raises:
-        InputError: the file or the scheduler is not usable.
+        InputError: the file, the scheduler or the number of threads is not usable.
     """
+    require_threads(num_threads)
     if isinstance(dives, (str, Path)):
         dives = load_dives(dives)
     limit = None if num_threads < 0 else num_threads

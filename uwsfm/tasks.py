@@ -273,6 +273,19 @@ def require_address(scheduler: str) -> None:
         )
 
 
+def require_threads(num_threads: int) -> None:
+    """Refuse a number of threads or processes that does no work.
+
+    Raises:
+        InputError: it is neither positive nor -1, all cores.
+    """
+    if num_threads == 0 or num_threads < -1:
+        raise InputError(
+            "--threads (num_threads) must be positive, or -1 for all cores, got "
+            f"{num_threads}"
+        )
+
+
 def local_workers() -> int:
     """How many processes this machine has room for."""
     import psutil

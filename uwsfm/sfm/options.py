@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from uwsfm.errors import InputError
-from uwsfm.tasks import require_address
+from uwsfm.tasks import require_address, require_threads
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]
@@ -159,11 +159,7 @@ class StartOptions:
             raise InputError(
                 f"scene_distance_m must be positive, got {self.scene_distance_m}"
             )
-        if self.num_threads == 0 or self.num_threads < -1:
-            raise InputError(
-                f"num_threads must be positive, or -1 for all cores, "
-                f"got {self.num_threads}"
-            )
+        require_threads(self.num_threads)
         if not 0 <= self.seed <= MAX_SEED:
             raise InputError(f"seed must be between 0 and {MAX_SEED}, got {self.seed}")
         require_address(self.scheduler)
