@@ -75,8 +75,8 @@ def test_a_limit_on_what_a_cloud_lacks_is_refused(tmp_path: Path, rng):
     table = np.rec.fromarrays([*cloud.points.T, cloud.stddev], names="x,y,z,stddev")
     with pytest.raises(InputError, match=r"no range.*leave --max-relative-stddev out"):
         clean_points(table, CleanOptions(max_stddev_m=1.0, max_relative_stddev=1.0))
-    with pytest.raises(InputError, match="max_error_px must be positive"):
-        CleanOptions(max_error_px=-1.0)
+    with pytest.raises(InputError, match="--max-stddev must be positive, got nan"):
+        CleanOptions(max_stddev_m=np.nan)
     write_cloud(cloud, tmp_path / "cloud.ply")
     with pytest.raises(InputError, match=r"no point is left, 50 of 50.*'views'"):
         clean_cloud(tmp_path / "cloud.ply", tmp_path / "clean.ply", min_views=9)

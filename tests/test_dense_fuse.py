@@ -10,7 +10,7 @@ from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.fuse import fuse, noise_px, placed, robust_stddev
-from uwsfm.dense.options import bytes_of
+from uwsfm.dense.options import DenseOptions, bytes_of
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
@@ -183,3 +183,18 @@ def test_sizes_are_read():
     for text in ("", "much", "2TB", "-1GB"):
         with pytest.raises(InputError, match="is no size"):
             bytes_of(text)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("min_views", 0, "--min-views must be at least 1"),
+        ("voxel", np.inf, "--voxel must be positive"),
+        ("noise_px", -0.1, "--noise-px must be positive"),
+        ("max_memory", 0.0, "--max-memory must be positive"),
+        ("num_threads", 0, r"--threads \(num_threads\) must be positive"),
+    ],
+)
+def test_options_out_of_range_are_named_as_they_are_typed(option, value, words):
+    with pytest.raises(InputError, match=f"^{words}.*, got {value}"):
+        DenseOptions(**{option: value})

@@ -56,14 +56,16 @@ class KnownLengths:
         """
         arm = np.zeros(3) if lever_arm is None else np.asarray(lever_arm, dtype=float)
         if arm.shape != (3,) or not np.all(np.isfinite(arm)):
-            raise InputError(f"lever_arm must be three numbers, got {arm.tolist()}")
+            raise InputError(
+                f"--lever-arm (lever_arm) must be three numbers, got {arm.tolist()}"
+            )
         if np.abs(arm).max() > LONGEST_ARM_M:
             raise InputError(
-                f"lever_arm {arm.tolist()} is in metres: the antenna is not "
-                f"{np.abs(arm).max():g} m away from the camera"
+                f"--lever-arm (lever_arm) {arm.tolist()} is in metres: the antenna is "
+                f"not {np.abs(arm).max():g} m away from the camera"
             )
         if lever_arm is not None and positions is None:
-            raise InputError("lever_arm has no effect without positions")
+            raise InputError("--lever-arm (lever_arm) has no effect without positions")
         return cls(
             file=None if lengths is None else load_lengths(lengths),
             source=str(lengths),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 
 from uwsfm.errors import InputError
+from uwsfm.tasks import require_threads
 
 ASSUMED_NOISE_PX = 0.3
 """Of a disparity, where too few depth maps overlap to tell."""
@@ -35,15 +37,17 @@ class DenseOptions:
 
     def __post_init__(self) -> None:
         if self.min_views < 1:
-            raise InputError(f"min_views must be at least 1, got {self.min_views}")
+            raise InputError(f"--min-views must be at least 1, got {self.min_views}")
         if self.max_neighbours < 1:
             raise InputError(
                 f"max_neighbours must be at least 1, got {self.max_neighbours}"
             )
         for name in ("voxel", "noise_px", "max_memory"):
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise InputError(f"{name} must be positive, got {value}")
+            if value is not None and not 0.0 < value < math.inf:
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"{option} must be positive, got {value}")
+        require_threads(self.num_threads)
 
 
 def bytes_of(text: str) -> float:

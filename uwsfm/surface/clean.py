@@ -15,6 +15,7 @@ _RANGE = ("view_range",)
 _ERROR = ("reprojection_error_px",)
 # A normal distribution's standard deviation over its median absolute deviation.
 _MAD_TO_STDDEV = 1.4826
+_NUM_NEIGHBOURS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +38,12 @@ class CleanOptions:
     """Standard deviations that the logarithm of a point's mean distance to its
     neighbours may be above the median: the spacing varies by factors, and a few stray
     points must not widen the limit."""
-    num_neighbours: int = 16
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value is not None and not value > 0:
-                raise InputError(f"clean: {name} must be positive, got {value}")
+                option = f"--{name.removesuffix('_m').replace('_', '-')}"
+                raise InputError(f"{option} must be positive, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +117,7 @@ def clean_points(
     if options.outlier_ratio is not None:
         stray = np.zeros(len(table), dtype=bool)
         rows = np.flatnonzero(keep)
-        stray[rows] = outliers(xyz[rows], options.num_neighbours, options.outlier_ratio)
+        stray[rows] = outliers(xyz[rows], _NUM_NEIGHBOURS, options.outlier_ratio)
         apply("neighbours", options.outlier_ratio, ~stray)
     return keep, filters
 
