@@ -18,6 +18,17 @@ assert tangents(0.0, 0.0, 1.0)[0] == 1.0
 print(CACHE_DIR, sum(tangents.stats.cache_hits.values()))
 """
 
+# Projects through a port, by kernels whose sums may be regrouped.
+DIGITS = """
+from hashlib import sha256
+import numpy as np
+from uwsfm.simulate.rigs import sample_rig
+
+points = np.random.default_rng(0).uniform((-0.6, -0.4, 0.4), (0.6, 0.4, 3.0), (1000, 3))
+xy, _ = sample_rig().refractive_cameras()[0].img_from_point(points)
+print(sha256(xy.tobytes()).hexdigest())
+"""
+
 # What the commands compile after the first run's jobs, which are of simulated features:
 # a few images of the sample, mapped and refined.
 LEFT = """
@@ -72,6 +83,11 @@ def test_processes_that_start_cold_together_share_one_cache(tmp_path):
     assert Path(folders.pop()).is_relative_to(tmp_path)
     later = output(start(SMALL, UWSFM_CACHE_DIR=str(tmp_path)))
     assert later.split()[1] == "1"
+
+
+def test_a_process_that_compiles_computes_the_digits_of_one_that_loads(tmp_path):
+    runs = [output(start(DIGITS, UWSFM_CACHE_DIR=str(tmp_path))) for _ in range(2)]
+    assert runs[0] == runs[1]
 
 
 def test_another_installation_keeps_kernels_of_its_own(tmp_path):

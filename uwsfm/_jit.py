@@ -19,9 +19,11 @@ from typing import Any, TypeVar
 
 import numba
 from filelock import FileLock
-from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+from llvmlite.binding import Linkage, get_host_cpu_features, get_host_cpu_name
 from numba.core import config
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 
 from uwsfm.errors import InputError
@@ -94,6 +96,30 @@ class _SharedCache(FunctionCache):
             super().save_overload(*args)
 
 
+class _ClosedLibrary(JITCodeLibrary):
+    """Machine code of a kernel, in which what it calls is its own.
+
+    Numba's is open: a process that compiles calls the functions that were compiled for
+    themselves, one that loads calls the copies beside the kernel, and as sums may be
+    regrouped, their last digits differed.
+    """
+
+    def _finalize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.linkage == Linkage.linkonce_odr:
+                function.linkage = Linkage.internal
+        super()._finalize_final_module()
+
+
+class _KernelCompiler(Compiler):
+    def define_pipelines(self) -> list[Any]:
+        state = self.state
+        codegen, name = state.targetctx.codegen(), state.func_id.func_qualname
+        state.library = _ClosedLibrary(codegen, name)
+        state.library.enable_object_caching()
+        return super().define_pipelines()
+
+
 class _Dispatcher(CPUDispatcher):
     def enable_caching(self) -> None:
         self._cache = _SharedCache(self.py_func)
@@ -145,6 +171,8 @@ def lane(function: Function) -> Function:
 
 def _compiled(function: Function, dispatcher: type[_Dispatcher], **options: Any) -> Any:
     options["no_cpython_wrapper"] = issubclass(dispatcher, _InnerDispatcher)
+    if dispatcher is _Dispatcher:
+        options["pipeline_class"] = _KernelCompiler
     made: Any = numba.njit(**_OPTIONS, **options)(function)
     if isinstance(made, CPUDispatcher):  # not where compilation is turned off
         made.__class__ = dispatcher
