@@ -155,11 +155,24 @@ class _Functions(NamedTuple):
     trtri: Callable
     trmm: Callable
     trsm: Callable
+    trsv: Callable
 
     @classmethod
     def of(cls, dtype: DTypeLike) -> "_Functions":
         factors = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
-        return cls(*factors, *blas.get_blas_funcs(("trmm", "trsm"), dtype=dtype))
+        products = blas.get_blas_funcs(("trmm", "trsm", "trsv"), dtype=dtype)
+        return cls(*factors, *products)
+
+    def solve(self, own: Array, right: Array, *, turned: bool) -> None:
+        """Solve a triangle's rows (k, k) for columns (k, r), in place; turned: L^-T."""
+        if right.shape[1] == 1:  # twice as fast as trsm, which packs the triangle
+            trans = int(turned)
+            self.trsv(own.T, right[:, 0], lower=1, trans=trans, overwrite_x=1)
+        else:
+            trans = int(not turned)  # of the columns' rows
+            self.trsm(
+                1.0, own.T, right.T, side=1, lower=1, trans_a=trans, overwrite_b=1
+            )
 
 
 def _square(rest: Array, out: Array) -> None:
@@ -281,9 +294,7 @@ class BlockCholesky:
             self._tree.fronts, self._panels, self._rows, strict=True
         ):
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
-            self._functions.trsm(
-                1.0, panel.own.T, part.T, side=1, lower=1, trans_a=1, overwrite_b=1
-            )
+            self._functions.solve(panel.own, part, turned=False)
             if len(rows):
                 out[rows] -= panel.rest.T @ part
         return out
@@ -297,9 +308,7 @@ class BlockCholesky:
             part = out[6 * front.first : 6 * (front.first + front.num_pivots)]
             if len(rows):
                 part -= panel.rest @ out[rows]
-            self._functions.trsm(
-                1.0, panel.own.T, part.T, side=1, lower=1, overwrite_b=1
-            )
+            self._functions.solve(panel.own, part, turned=True)
         return out
 
     def inverse_blocks(self, blocks: Array) -> None:
