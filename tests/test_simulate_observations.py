@@ -108,7 +108,12 @@ def test_a_rig_that_looks_away_from_the_floor_is_an_error():
         (lambda: ObservationOptions(outlier_ratio=1.5), "outlier_ratio"),
         (lambda: ObservationOptions(num_points=0), "num_points"),
         (lambda: ObservationOptions(noise_px=float("nan")), "noise_px"),
+        (lambda: ObservationOptions(noise_px=float("inf")), "noise_px"),
+        (lambda: ObservationOptions(seed=-1), "seed"),
         (lambda: Relief(stddev=-0.1), "stddev"),
+        (lambda: Relief(stddev=float("inf")), "stddev"),
+        (lambda: Relief(seed=-1), "seed"),
+        (lambda: simulate_scene(paper_rig(), np.full((2, 7), np.nan)), "rig_from_wor"),
         (lambda: Relief(correlation_length=0.0), "correlation_length"),
     ],
 )

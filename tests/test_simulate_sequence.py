@@ -2,12 +2,14 @@
 
 import hashlib
 import json
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from uwsfm.cli import main
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.rig_file import dump_rig, load_rig
@@ -169,6 +171,33 @@ def test_wrong_observation_options_are_refused(tmp_path):
         simulate_observations(tmp_path / "dive.npz", num_frames=1)
     with pytest.raises(InputError, match=r"nothing\.npz"):
         read_observations(tmp_path / "nothing.npz")
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1", "1e12"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "frames",
+        "altitude-m",
+        "relief-m",
+        "points",
+        "noise-px",
+        "outliers",
+        "distance-m",
+        "thickness-m",
+        "focal-px",
+        "seed",
+    ],
+)
+def test_absurd_numbers_are_refused_by_the_name_of_their_option(
+    tmp_path, monkeypatch, capsys, option, value
+):
+    arguments = ["simulate", "observations", "-o", str(tmp_path / "dive.npz")]
+    monkeypatch.setattr(sys, "argv", ["uwsfm", *arguments, f"--{option}", value])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2 and f"--{option}" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
 
 
 def test_the_committed_sample_is_whole_and_small():

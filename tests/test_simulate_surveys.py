@@ -37,8 +37,12 @@ def test_neighbouring_lines_and_cross_lines_share_points():
     assert np.ptp(np.flatnonzero(cross[:, :55].any(axis=0))) > 40
 
 
-def test_an_unknown_survey_is_refused():
+def test_what_is_no_survey_is_refused():
     with pytest.raises(InputError, match="pool, reef, field"):
         simulate_survey("ocean")
     with pytest.raises(InputError, match="12 frames"):
         simulate_survey(SPEC, num_frames=5)
+    for name in ("spacing", "line_spacing", "altitude", "sway_deg", "heave"):
+        for value in (-1.0, np.nan, np.inf):
+            with pytest.raises(InputError, match=rf"^{name} must .*, got {value}"):
+                simulate_survey(SPEC, **{name: value})

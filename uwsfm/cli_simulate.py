@@ -6,6 +6,10 @@ from typing import Annotated, Literal
 import typer
 
 from uwsfm._signals import NOTHING_WRITTEN, interruptible
+from uwsfm.cli_options import SeedOption
+
+MAX_RANGE_M = 10
+"""Beyond it the water hides the floor."""
 
 simulate_app = typer.Typer(
     help="Synthetic dives with known truth.", no_args_is_help=True
@@ -26,7 +30,8 @@ def simulate_images(
         int | None, typer.Option(help="Only the first frames of the preset.")
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Another floor and noise; same rig and motion.")
+        int | None,
+        typer.Option(min=0, help="Another floor and noise; same rig and motion."),
     ] = None,
     clear_water: Annotated[
         bool, typer.Option("--clear-water", help="No attenuation, no veil.")
@@ -56,20 +61,33 @@ def simulate_observations(
     trajectory: Annotated[
         Literal["rich", "strip", "lawn-mower"], typer.Option(help="How the rig moves.")
     ] = "rich",
-    frames: Annotated[int, typer.Option(min=2, help="Stereo pairs.")] = 15,
-    altitude_m: Annotated[float, typer.Option(help="Mean height above ground.")] = 2.0,
+    frames: Annotated[int, typer.Option(min=2, max=100_000, help="Stereo pairs.")] = 15,
+    altitude_m: Annotated[
+        float,
+        typer.Option(min=0.01, max=MAX_RANGE_M, help="Mean height above ground."),
+    ] = 2.0,
     relief_m: Annotated[
-        float, typer.Option(min=0, help="Its standard deviation.")
+        float, typer.Option(min=0, max=MAX_RANGE_M, help="Its standard deviation.")
     ] = 0.2,
-    points: Annotated[int, typer.Option(min=1, help="Seen at least twice.")] = 800,
-    noise_px: Annotated[float, typer.Option(min=0, help="Per image coordinate.")] = 0.5,
+    points: Annotated[
+        int, typer.Option(min=1, max=10_000_000, help="Seen at least twice.")
+    ] = 800,
+    noise_px: Annotated[
+        float, typer.Option(min=0, max=100, help="Per image coordinate.")
+    ] = 0.5,
     outliers: Annotated[
         float, typer.Option(min=0, max=1, help="Share of the observations.")
     ] = 0.0,
-    distance_m: Annotated[float, typer.Option(help="Of both ports.")] = 0.02,
-    thickness_m: Annotated[float, typer.Option(help="Of both glasses.")] = 0.005,
-    focal_px: Annotated[float, typer.Option(help="Of both cameras.")] = 1000.0,
-    seed: Annotated[int, typer.Option(help="Of floor, points and noise.")] = 0,
+    distance_m: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Of both ports.")
+    ] = 0.02,
+    thickness_m: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Of both glasses.")
+    ] = 0.005,
+    focal_px: Annotated[
+        float, typer.Option(min=100, max=100_000, help="Of both cameras.")
+    ] = 1000.0,
+    seed: SeedOption = 0,
 ) -> None:
     """Simulate what a stereo rig observes, with ground truth, as arrays.
 

@@ -133,7 +133,7 @@ def simulate_observations(
 
 def _trajectory(name: str, num_frames: int, altitude: float) -> Array:
     """Poses (num_frames, 7), neighbours overlapping by about 80 % at any altitude."""
-    if num_frames < 2 or not altitude > 0.0:
+    if num_frames < 2 or not 0.0 < altitude < np.inf:
         raise InputError(
             "a trajectory needs at least two frames and a positive altitude, "
             f"got {num_frames} and {altitude}"

@@ -51,12 +51,13 @@ class ObservationOptions:
     def __post_init__(self) -> None:
         ranges = {
             "num_points": (1, np.inf),
-            "noise_px": (0.0, np.inf),
+            "noise_px": (0.0, 100.0),
             "outlier_ratio": (0.0, 1.0),
             "detection_rate": (1e-9, 1.0),
             "min_observations": (1, np.inf),
             "max_range": (1e-9, np.inf),
             "max_incidence_deg": (1e-9, 90.0),
+            "seed": (0, np.inf),
         }
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
@@ -96,11 +97,14 @@ def simulate_scene(
         The scene, with observations ordered by point, then frame, then camera.
 
     Raises:
+        InputError: poses that are not finite.
         UwsfmError: the rig sees too little of the floor to find the points asked for.
     """
     relief, options = relief or Relief(), options or ObservationOptions()
     rng = np.random.default_rng(options.seed)
     rig_from_world = np.asarray(rig_from_world, dtype=np.float64)  # (F, 7)
+    if not np.all(np.isfinite(rig_from_world)):
+        raise InputError("rig_from_world has poses that are not finite")
     dive = _Dive(
         rig.refractive_cameras(),
         known_cam_from_rig(rig),

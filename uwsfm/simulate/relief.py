@@ -21,7 +21,8 @@ class Relief:
     unbounded in extent, and its slope is known in closed form.
 
     Raises:
-        InputError: a negative stddev or a correlation length that is not positive.
+        InputError: a negative or infinite stddev, a correlation length that is not
+            positive, or a negative seed.
     """
 
     stddev: float = 0.0
@@ -31,8 +32,12 @@ class Relief:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.stddev >= 0.0:
-            raise InputError(f"relief stddev must not be negative, got {self.stddev}")
+        if not 0.0 <= self.stddev < np.inf:
+            raise InputError(
+                f"relief stddev must be finite and not negative, got {self.stddev}"
+            )
+        if not self.seed >= 0:
+            raise InputError(f"relief seed must not be negative, got {self.seed}")
         if not self.correlation_length > 0.0:
             raise InputError(
                 "relief correlation_length must be positive, "

@@ -61,8 +61,19 @@ def survey_track(spec: SurveySpec) -> Array:
     """Poses (num_frames, 7): lines along y, then cross lines along x.
 
     Raises:
-        InputError: too few frames for two lines and a cross line.
+        InputError: too few frames for two lines and a cross line, a length that is not
+            positive, or a negative sway or heave.
     """
+    for name in ("spacing", "line_spacing", "altitude"):
+        if not 0.0 < getattr(spec, name) < np.inf:
+            raise InputError(
+                f"{name} must be finite and positive, got {getattr(spec, name)}"
+            )
+    for name in ("sway_deg", "heave"):
+        if not 0.0 <= getattr(spec, name) < np.inf:
+            raise InputError(
+                f"{name} must be finite and not negative, got {getattr(spec, name)}"
+            )
     if spec.num_frames < 12:
         raise InputError(f"a survey needs at least 12 frames, got {spec.num_frames}")
     ratio = spec.line_spacing / spec.spacing
