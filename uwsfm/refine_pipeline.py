@@ -55,7 +55,12 @@ from uwsfm.sfm.model_database import (
 )
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
-from uwsfm.sfm.refine import Refined, refine_scene, rig_options
+from uwsfm.sfm.refine import (
+    Refined,
+    refine_scene,
+    rig_options,
+    without_empty_frames,
+)
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 """Camera models without distortion: light through a flat port never fits them."""
@@ -282,7 +287,7 @@ class _Job:
     def _model(self, refined: Refined, tracks: Tracks) -> tuple[Model, Refined]:
         """The result and its calibration, without frames that nothing is left of."""
         kept, all_frames = refined.kept, refined.scene.frame_idx
-        refined, frames = _without_empty_frames(refined)
+        refined, frames = without_empty_frames(refined)
         names = tuple(tracks.frame_names[f] for f in frames)
         seen = set(zip(refined.scene.camera_idx, all_frames, strict=True))
         none = np.empty((0, 2))
@@ -368,41 +373,3 @@ class _Job:
 def _mean(values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else None
-
-
-def _without_empty_frames(refined: Refined) -> tuple[Refined, NDArray[np.int64]]:
-    """Without the frames that no observation is left of, and which frames are left."""
-    scene, calibration = refined.scene, refined.calibration
-    frames, frame_idx = np.unique(scene.frame_idx, return_inverse=True)
-    smaller = replace(
-        scene,
-        rig_from_world=scene.rig_from_world[frames],
-        frame_idx=frame_idx.astype(np.int64),
-    )
-    covariance = replace(
-        calibration.covariance, frames=calibration.covariance.frames[frames]
-    )
-    positions, entered = calibration.positions, calibration.entered
-    bars = calibration.bars
-    calibration = replace(
-        calibration,
-        scene=smaller,
-        covariance=covariance,
-        positions=None if positions is None else positions.in_frames(frames),
-        entered=None if entered is None else entered.in_frames(frames),
-        bars=None if bars is None else _in_frames(bars, frames),
-    )
-    return replace(refined, scene=smaller, calibration=calibration), frames
-
-
-def _in_frames(bars: Scene, frames: NDArray[np.int64]) -> Scene:
-    """Clicks in some frames only, numbered as they are there; every point stays."""
-    there = np.isin(bars.frame_idx, frames)
-    return replace(
-        bars,
-        rig_from_world=bars.rig_from_world[frames],
-        camera_idx=bars.camera_idx[there],
-        frame_idx=np.searchsorted(frames, bars.frame_idx[there]),
-        point_idx=bars.point_idx[there],
-        xy=bars.xy[there],
-    )

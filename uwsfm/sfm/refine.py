@@ -125,6 +125,44 @@ def refine_scene(
     )
 
 
+def without_empty_frames(refined: Refined) -> tuple[Refined, IndexArray]:
+    """Without the frames that no observation is left of, and which frames are left."""
+    scene, calibration = refined.scene, refined.calibration
+    frames, frame_idx = np.unique(scene.frame_idx, return_inverse=True)
+    smaller = replace(
+        scene,
+        rig_from_world=scene.rig_from_world[frames],
+        frame_idx=frame_idx.astype(np.int64),
+    )
+    covariance = replace(
+        calibration.covariance, frames=calibration.covariance.frames[frames]
+    )
+    positions, entered = calibration.positions, calibration.entered
+    bars = calibration.bars
+    calibration = replace(
+        calibration,
+        scene=smaller,
+        covariance=covariance,
+        positions=None if positions is None else positions.in_frames(frames),
+        entered=None if entered is None else entered.in_frames(frames),
+        bars=None if bars is None else _in_frames(bars, frames),
+    )
+    return replace(refined, scene=smaller, calibration=calibration), frames
+
+
+def _in_frames(bars: Scene, frames: IndexArray) -> Scene:
+    """Clicks in some frames only, numbered as they are there; every point stays."""
+    there = np.isin(bars.frame_idx, frames)
+    return replace(
+        bars,
+        rig_from_world=bars.rig_from_world[frames],
+        camera_idx=bars.camera_idx[there],
+        frame_idx=np.searchsorted(frames, bars.frame_idx[there]),
+        point_idx=bars.point_idx[there],
+        xy=bars.xy[there],
+    )
+
+
 def _at_scale(scene: Scene, lengths: Lengths, trusted: NDArray[np.bool_]) -> Scene:
     """The scene of one camera, at the scale of its lengths."""
     if len(scene.cameras) > 1 or not lengths.give_scale:
