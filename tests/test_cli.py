@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 import textwrap
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from command_line import one_sentence, run
 from filelock import FileLock
 from sfm_scenes import model_of
 
@@ -28,12 +28,16 @@ COMMANDS = [
     [],
     ["init"],
     ["reconstruct"],
+    ["calibrate"],
+    ["refine"],
     ["demo"],
     ["batch"],
     ["clean"],
     ["color"],
+    ["dense"],
     ["export"],
     ["map"],
+    ["measure"],
     ["mesh"],
     ["report"],
     ["view"],
@@ -41,17 +45,6 @@ COMMANDS = [
     ["simulate", "images"],
     ["simulate", "observations"],
 ]
-
-
-def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """The command line as a user starts it."""
-    return subprocess.run(
-        [sys.executable, "-c", "from uwsfm.cli import main; main()", *arguments],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        check=False,
-    )
 
 
 def test_version():
@@ -105,28 +98,19 @@ def test_init_writes_a_rig_file_once(tmp_path):
     assert (tmp_path / "rig.yaml").read_text() == written
 
 
-def _one_sentence(found: subprocess.CompletedProcess[str], *parts: str) -> None:
-    assert found.returncode != 0
-    lines = [line for line in found.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, found.stderr
-    assert "Traceback" not in found.stderr
-    for part in parts:
-        assert part in lines[0]
-
-
 def test_reconstruct_names_what_is_missing(tmp_path):
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "nowhere.yaml", "images", "-o", "out", cwd=tmp_path),
         "nowhere.yaml",
     )
     run("init", "rig.yaml", cwd=tmp_path)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", "images", "-o", "out", cwd=tmp_path),
         "images",
         "does not exist",
     )
     (tmp_path / "images" / "left").mkdir(parents=True)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", "images", "-o", "out", cwd=tmp_path),
         "left",
         "holds no image",
@@ -139,7 +123,7 @@ def test_reconstruct_never_overwrites_a_foreign_model(tmp_path):
     keep = tmp_path / "project" / "sparse" / "cameras.bin"
     keep.write_bytes(b"mine")
     run("init", "rig.yaml", cwd=tmp_path)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", ".", "-o", "project", cwd=tmp_path),
         "was not made by uwsfm",
     )
@@ -152,7 +136,7 @@ def test_reconstruct_never_clears_a_foreign_folder(tmp_path):
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
     run("init", "rig.yaml", cwd=tmp_path)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path),
         "was not made by uwsfm",
     )
@@ -167,7 +151,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
             (tmp_path / folder / name).write_bytes(b"x")
     (tmp_path / "out" / WORK).mkdir(parents=True)
     with FileLock(tmp_path / "out" / WORK / "lock"):
-        _one_sentence(
+        one_sentence(
             run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path),
             "another uwsfm is at work",
         )
@@ -198,7 +182,7 @@ def test_unsupported_lens_is_named(tmp_path):
         "params: [1400.0, 1400.0, 960.0, 540.0, 0.9]",
     )
     (tmp_path / "rig.yaml").write_text(text)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path), "'left'", "FOV"
     )
 
@@ -219,7 +203,7 @@ def test_unsupported_lens_is_named(tmp_path):
 def test_calibrate_names_the_mistake(tmp_path, options, words):
     run("init", "rig.yaml", cwd=tmp_path)
     arguments = ["calibrate", "rig.yaml", "images", "-o", "out", *options]
-    _one_sentence(run(*arguments, cwd=tmp_path), words)
+    one_sentence(run(*arguments, cwd=tmp_path), words)
     assert {path.name for path in tmp_path.iterdir()} == {"rig.yaml"}
 
 
@@ -241,19 +225,19 @@ def test_simulated_observations_calibrate_back_as_the_readme_says(
     for port, true, known in zip(scene.ports, truth.ports, cameras, strict=True):
         miss = abs(port.distance - true.distance)
         assert 0.0 < miss < 4.0 * known.distance_stddev_m < 0.01  # started 10 mm off
-    _one_sentence(
+    one_sentence(
         run("simulate", "observations", "-o", "dive.npz", cwd=tmp_path),
         "dive.npz exists already",
     )
     run("init", "rig.yaml", cwd=tmp_path)
-    _one_sentence(
+    one_sentence(
         run("calibrate", "rig.yaml", "dive.npz", "-o", "out", cwd=tmp_path),
         "uwsfm.simulate.read_observations('dive.npz')",
     )
-    _one_sentence(
+    one_sentence(
         run("simulate", "observations", "-o", "dive.txt", cwd=tmp_path), ".npz"
     )
-    _one_sentence(
+    one_sentence(
         run("simulate", "images", "-o", "d", "--preset", "ocean", cwd=tmp_path), "ocean"
     )
 
@@ -275,7 +259,7 @@ def test_export_writes_what_is_asked(tmp_path, to):
         assert "image folders left, right, baseline 0.2 m" in back.stdout
         assert load_rig(tmp_path / "back.yaml").cameras[0].port == rig.cameras[0].port
     again = run("export", "out", "-o", "target", "--to", to, cwd=tmp_path)
-    _one_sentence(again, "target exists already")
+    one_sentence(again, "target exists already")
 
 
 def test_init_says_of_which_cameras_a_model_has_no_port(tmp_path):
@@ -295,7 +279,7 @@ def test_init_says_of_which_cameras_a_model_has_no_port(tmp_path):
     assert data["water"] == {"refractive_index": 1.333}
     (tmp_path / "cameras.txt").rename(tmp_path / "cameras.bin")
     found = run("init", "again.yaml", "--from", ".", cwd=tmp_path)
-    _one_sentence(found, "only cameras.bin: ports are in text models that Refractive")
+    one_sentence(found, "only cameras.bin: ports are in text models that Refractive")
 
 
 @pytest.mark.parametrize(
@@ -306,93 +290,17 @@ def test_init_says_of_which_cameras_a_model_has_no_port(tmp_path):
     ],
 )
 def test_export_names_the_mistake(tmp_path, arguments, words):
-    _one_sentence(run("export", *arguments, "-o", "target", cwd=tmp_path), words)
+    one_sentence(run("export", *arguments, "-o", "target", cwd=tmp_path), words)
     found = run("export", "out", "-o", "target", "--to", "pdf", cwd=tmp_path)
     assert found.returncode == 2
     assert "'pdf' is not one of" in " ".join(found.stderr.split())
     assert not list(tmp_path.iterdir())
 
 
-STOPPED = """
-import os, signal, sys, time
-import typer
-from uwsfm import cli
-
-@cli.app.command()
-def wait():
-    from uwsfm.console import ProgressBars
-    with ProgressBars():
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(60)
-
-sys.argv = ["uwsfm", "wait"]
-cli.main()
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
-def test_sigterm_ends_in_the_sentence_of_an_interrupted_run():
-    """Not in a stack dump, which pycolmap's logging would print."""
-    found = subprocess.run(
-        [sys.executable, "-c", STOPPED], capture_output=True, text=True, check=False
-    )
-    assert found.returncode == 143
-    assert found.stderr == "interrupted; the same command resumes the run\n"
-
-
-STOPPED_WRITING = """
-import json, os, signal, sys
-from typer.testing import CliRunner
-from uwsfm._files import PARTIAL
-from uwsfm.cli import app
-
-def stop(event, arguments):
-    if event == "open" and PARTIAL in str(arguments[0]):
-        os.kill(os.getpid(), signal.SIGTERM)
-
-sys.addaudithook(stop)
-for line in sys.stdin:
-    found = CliRunner().invoke(app, json.loads(line))
-    print(found.exit_code, found.output, end="")
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
-def test_commands_that_are_stopped_while_they_write_leave_nothing(
-    dive_result, tmp_path
-):
-    """The signal comes when the first of their files is opened."""
-    pytest.importorskip("tifffile")
-    out = tmp_path / "out"
-    shutil.copytree(dive_result.out, out)
-    distance = ("--from", "1", "--to", "2")
-    commands = [
-        ("clean", out, "-o", out / "good.ply"),
-        ("map", out, "-o", out / "map"),
-        ("measure", out, *distance, "-o", out / "measured.json"),
-        ("report", out),
-        ("export", out, "--to", "ply", "-o", out / "scene.ply"),
-    ]
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    del before[out]  # where files were, for a moment
-    found = subprocess.run(
-        [sys.executable, "-c", STOPPED_WRITING],
-        input="".join(json.dumps([str(w) for w in words]) + "\n" for words in commands),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    sentence = "130 interrupted; nothing was written\n"
-    assert (found.stdout, found.stderr) == (len(commands) * sentence, "")
-    after = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    del after[out]
-    assert after == before
-
-
 def test_output_folder_that_is_a_file(tmp_path):
     (tmp_path / "out").write_text(json.dumps({}))
     run("init", "rig.yaml", cwd=tmp_path)
-    _one_sentence(
+    one_sentence(
         run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path), "is a file"
     )
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from command_line import one_sentence, run
 from sfm_scenes import model_of
-from test_cli import _one_sentence, run
 from test_outside import (
     ARM,
     NAV_STDDEV,
@@ -210,7 +210,7 @@ CSV_PROBLEMS = {
 
 
 @pytest.mark.parametrize(("text", "words"), CSV_PROBLEMS.items())
-def test_wrong_positions_end_in_one_sentence(tmp_path, text, words):
+def test_wrong_positions_end_inone_sentence(tmp_path, text, words):
     file = tmp_path / "nav.csv"
     file.write_text(text)
     with pytest.raises(InputError) as refused:
@@ -236,7 +236,7 @@ PAIR = {"length_m": 1.0, "stddev_m": 0.1, "frames": ["a", "b"]}
         ({"frame_distances": [{**PAIR, "stddev_m": float("nan")}]}, "stddev_m"),
     ],
 )
-def test_wrong_lengths_end_in_one_sentence(tmp_path, content, words):
+def test_wrong_lengths_end_inone_sentence(tmp_path, content, words):
     file = lengths_yaml(tmp_path / "lengths.yaml", **content)
     with pytest.raises(InputError) as refused:
         load_lengths(file)
@@ -250,7 +250,7 @@ def test_unknown_names_are_refused_before_anything_is_written(mono, tmp_path, rn
     nav = positions_csv(tmp_path / "nav.csv", found, names)
     arguments = ("refine", str(mono.model), str(mono.rig), "-o", str(tmp_path / "out"))
     done = run(*arguments, "--positions", str(nav))
-    _one_sentence(done, "'0000.png' is not among the images", "'0000.jpg'")
+    one_sentence(done, "'0000.png' is not among the images", "'0000.jpg'")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="--lever-arm 1,2: write three numbers"):
         lever_arm_of("1,2")

@@ -1,0 +1,83 @@
+"""SIGTERM: one sentence, and nothing half-written."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+STOPPED = """
+import os, signal, sys, time
+import typer
+from uwsfm import cli
+
+@cli.app.command()
+def wait():
+    from uwsfm.console import ProgressBars
+    with ProgressBars():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+sys.argv = ["uwsfm", "wait"]
+cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
+def test_sigterm_ends_in_the_sentence_of_an_interrupted_run():
+    """Not in a stack dump, which pycolmap's logging would print."""
+    found = subprocess.run(
+        [sys.executable, "-c", STOPPED], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 143
+    assert found.stderr == "interrupted; the same command resumes the run\n"
+
+
+STOPPED_WRITING = """
+import json, os, signal, sys
+from typer.testing import CliRunner
+from uwsfm._files import PARTIAL
+from uwsfm.cli import app
+
+def stop(event, arguments):
+    if event == "open" and PARTIAL in str(arguments[0]):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+sys.addaudithook(stop)
+for line in sys.stdin:
+    found = CliRunner().invoke(app, json.loads(line))
+    print(found.exit_code, found.output, end="")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
+def test_commands_that_are_stopped_while_they_write_leave_nothing(
+    dive_result, tmp_path
+):
+    """The signal comes when the first of their files is opened."""
+    pytest.importorskip("tifffile")
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    distance = ("--from", "1", "--to", "2")
+    commands = [
+        ("clean", out, "-o", out / "good.ply"),
+        ("map", out, "-o", out / "map"),
+        ("measure", out, *distance, "-o", out / "measured.json"),
+        ("report", out),
+        ("export", out, "--to", "ply", "-o", out / "scene.ply"),
+    ]
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    del before[out]  # where files were, for a moment
+    found = subprocess.run(
+        [sys.executable, "-c", STOPPED_WRITING],
+        input="".join(json.dumps([str(w) for w in words]) + "\n" for words in commands),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    sentence = "130 interrupted; nothing was written\n"
+    assert (found.stdout, found.stderr) == (len(commands) * sentence, "")
+    after = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    del after[out]
+    assert after == before
