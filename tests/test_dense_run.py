@@ -69,7 +69,7 @@ def test_wrong_input_is_told_in_one_sentence(dive: DenseDive, tmp_path):
     for options, words in (
         ({"max_memory": 1e7}, "--max-memory 0.01GB is too little"),
         ({"voxels": 1}, "unknown option voxels"),
-        ({"noise_px": -1.0}, "noise_px must be positive"),
+        ({"noise_px": -1.0}, "--noise-px must be positive"),
         ({"min_views": 99}, "--min-views 99: there are [0-9]+ depth maps"),
         # No two depth maps agree to a millionth of a pixel.
         ({"noise_px": 1e-9}, "no point is confirmed by 2 depth maps: of [1-9]"),
