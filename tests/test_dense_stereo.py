@@ -54,7 +54,7 @@ def test_a_slanted_plane_is_measured_without_bend(sample_pair):
     pair, plane = sample_pair
     truth, visible = seen_by_both(pair, plane)
     slabs = rectifications(pair)
-    depth = stereo_depth(slabs, *images_of(pair, plane), 1e9).depth
+    depth = stereo_depth(slabs, *images_of(pair, plane), 1e9)
     error = depth.ranges - truth
     px = np.abs(error / depth.sensitivity)[visible]
     # A pixel that only one image shows in full is lost along the border.
@@ -71,7 +71,7 @@ def test_a_slanted_plane_is_measured_without_bend(sample_pair):
 
 def test_the_sensitivity_is_the_range_per_pixel(sample_pair):
     pair, plane = sample_pair
-    depth = stereo_depth(rectifications(pair), *images_of(pair, plane), 1e9).depth
+    depth = stereo_depth(rectifications(pair), *images_of(pair, plane), 1e9)
     truth, visible = seen_by_both(pair, plane)
     # By the exact projections: how far the match moves in the right image when the
     # point moves a little along the left ray.
@@ -126,7 +126,7 @@ def test_the_depth_range_is_split_where_rows_part():
     assert max(slab.deviation_px for slab in slabs) <= MAX_DEVIATION_PX
     assert all(a.far == b.near for a, b in zip(slabs, slabs[1:], strict=False))
     truth, visible = seen_by_both(pair, plane)
-    depth = stereo_depth(slabs, *images_of(pair, plane), 1e9).depth
+    depth = stereo_depth(slabs, *images_of(pair, plane), 1e9)
     px = np.abs((depth.ranges - truth) / depth.sensitivity)
     origins, dirs = pair.left.ray_from_img(pixel_rows(pair.left, 0, 180))
     along = (origins - slabs[0].centers[0] + truth.reshape(-1, 1) * dirs) @ (

@@ -21,7 +21,7 @@ from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.surface.commands import make_map
 from uwsfm.surface.height_map import make_height_map
-from uwsfm.surface.level import UPS, find_level, fit_plane, level_by_axis, rotation_of
+from uwsfm.surface.level import UPS, find_level, fit_plane, level_by_axis
 from uwsfm.surface.source import find_source
 
 tifffile = pytest.importorskip("tifffile")
@@ -132,13 +132,13 @@ def test_a_unit_that_nothing_tells_is_never_a_metre(tmp_path: Path, rng):
 
 def test_axes_of_the_world_become_right_handed_maps():
     for up in UPS[1:]:
-        rotation = rotation_of(level_by_axis(up))
-        assert np.linalg.det(rotation) == pytest.approx(1.0)
-        axis = "xyz".index(up[-1])
-        assert rotation[2, axis] == pytest.approx(-1.0 if up[0] == "-" else 1.0)
+        # Mirrored axes are no rotation, and raise: the third tells the rest.
+        axis = np.eye(3)["xyz".index(up[-1])] * (-1.0 if up[0] == "-" else 1.0)
+        turned = rigid3.transform(level_by_axis(up).map_from_world, axis)
+        np.testing.assert_allclose(turned, [0.0, 0.0, 1.0], atol=1e-15)
     # North-east-down: the map's x is east, its y north.
-    ned = rotation_of(level_by_axis("-z"))
-    np.testing.assert_allclose(ned @ [2.0, 3.0, -4.0], [3.0, 2.0, 4.0], atol=1e-15)
+    ned = rigid3.transform(level_by_axis("-z").map_from_world, [2.0, 3.0, -4.0])
+    np.testing.assert_allclose(ned, [3.0, 2.0, 4.0], atol=1e-15)
 
 
 def test_planes_hold_against_a_third_of_strays(rng):

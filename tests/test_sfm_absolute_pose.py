@@ -12,7 +12,6 @@ from uwsfm.sfm.absolute_pose import (
     AbsolutePoseOptions,
     checked,
     estimate_rig_pose,
-    refine_rig_pose,
 )
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.rig_pose import normal_equations, pose_cost
@@ -189,14 +188,10 @@ def test_what_cannot_be_seen_is_an_outlier(rng):
     assert np.abs(offset(found.rig_from_world, truth)).max() < 1e-9
 
 
-def test_same_seed_same_bytes_and_refinement_is_a_fixed_point(rng):
+def test_same_seed_same_bytes(rng):
     args, _, _ = simulated(one_camera(), rng, noise_px=1.0, wrong=0.3)
     one, two = estimate_rig_pose(*args), estimate_rig_pose(*args)
     assert one.rig_from_world.tobytes() == two.rig_from_world.tobytes()
-    again = refine_rig_pose(*args, one.rig_from_world)
-    # It stops at a hundredth of a standard deviation.
-    apart = np.abs(offset(again.rig_from_world, one.rig_from_world))
-    assert (apart < 0.02 * np.sqrt(np.diag(one.covariance))).all()
 
 
 def test_no_pose_where_there_is_none(rng):

@@ -44,7 +44,7 @@ def features(frames, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("features") / "database.db"
     options = FeatureOptions(max_num_features=1500)
     extract_features(frames, rig, path, options, num_threads=2)
-    store_intrinsics(frames, rig, path)
+    store_intrinsics(rig, path)
     return path
 
 

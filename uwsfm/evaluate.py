@@ -1,7 +1,6 @@
 """An output folder beside the truth of a simulation."""
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,10 +40,6 @@ class DomeComparison:
     center_m: tuple[float, float, float]
     center_stddev_m: tuple[float | None, ...]
     true_center_m: tuple[float, float, float]
-
-    @property
-    def center_error_m(self) -> float:
-        return math.dist(self.center_m, self.true_center_m)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -108,7 +108,7 @@ class DepthMaps:
                 for (camera, _), name in zip(view.others, view.other_names, strict=True)
             ]
             if view.is_stereo:
-                depth = stereo_depth(slabs, image, others[0], budget).depth
+                depth = stereo_depth(slabs, image, others[0], budget)
             else:
                 camera = self.model.scene.cameras[view.camera]
                 sources = self._sources(view, others)

@@ -36,17 +36,9 @@ MIXED_PX = 1.0
 """Neighbours farther apart in disparity than this belong to two surfaces."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StereoDepth:
-    depth: DepthMap
-    slabs: tuple[Rectification, ...]
-    num_matched: int
-    """Pixels with a disparity, of all slabs; the rest of them lies outside its slab."""
-
-
 def stereo_depth(
     slabs: tuple[Rectification, ...], left: Gray, right: Gray, max_bytes: float
-) -> StereoDepth:
+) -> DepthMap:
     """Match two images and triangulate.
 
     Args:
@@ -57,13 +49,11 @@ def stereo_depth(
     shape = left.shape
     ranges = np.full(shape, np.nan, dtype=np.float32)
     sensitivity, best = ranges.copy(), np.full(shape, -np.inf, dtype=np.float32)
-    matched = 0
     for slab in slabs:
         pixels = slab.size[0] * slab.size[1]
         disparity, rows, correlation = _matched(
             slab, left, right, max_bytes - BYTES_PER_PIXEL * pixels
         )
-        matched += int(np.count_nonzero(np.isfinite(disparity)))
         count = max(1, BAND_PIXELS // shape[1])
         for top in range(0, shape[0], count):
             band = slice(top, min(top + count, shape[0]))
@@ -77,11 +67,7 @@ def stereo_depth(
                 (best, found.correlation),
             ):
                 whole[band][wins] = part[wins]
-    return StereoDepth(
-        depth=DepthMap(ranges=ranges, sensitivity=sensitivity),
-        slabs=slabs,
-        num_matched=matched,
-    )
+    return DepthMap(ranges=ranges, sensitivity=sensitivity)
 
 
 def rectified_images(slab: Rectification, left: Gray, right: Gray) -> tuple[Gray, Gray]:

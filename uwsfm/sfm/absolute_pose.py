@@ -87,8 +87,6 @@ class RigPose:
     covariance: Array
     """(6, 6) of the tangent [rotation, translation] as `rigid3.perturb`, of the noise
     in the image alone: the points are taken as exact. inf if not determined."""
-    num_trials: int
-    """Samples drawn; 0 for a refinement."""
 
 
 def estimate_rig_pose(
@@ -127,31 +125,10 @@ def estimate_rig_pose(
     rows = rows[np.argsort(matches[1][rows], kind="stable")]  # by camera
     world, index, pixels = matches
     usable_matches = (world[rows], index[rows], pixels[rows])
-    pose, trials = _search(rays[rows], usable_matches, rig, options)
+    pose = _search(rays[rows], usable_matches, rig, options)
     if pose is None:
         return None
-    return _refined(pose, matches, rig, options, trials)
-
-
-def refine_rig_pose(
-    cameras: Sequence[RefractiveCamera],
-    cam_from_rig: ArrayLike,
-    camera_idx: ArrayLike,
-    xy: ArrayLike,
-    points: ArrayLike,
-    rig_from_world: ArrayLike,
-    options: AbsolutePoseOptions | None = None,
-) -> RigPose | None:
-    """Adjust a pose (7,) to the matches within ``max_error_px`` of it.
-
-    Arguments, result and errors as of `estimate_rig_pose`.
-    """
-    options = options or AbsolutePoseOptions()
-    matches, rig = checked(cameras, cam_from_rig, camera_idx, xy, points)
-    start = np.asarray(rig_from_world, dtype=np.float64)
-    if start.shape != (7,):
-        raise InputError(f"rig_from_world.shape={start.shape}, expected (7,)")
-    return _refined(rigid3.matrix_rows(start), matches, rig, options, 0)
+    return _refined(pose, matches, rig, options)
 
 
 def checked(
@@ -176,8 +153,8 @@ def checked(
 
 def _search(
     rays: Array, matches: Matches, rig: RigRows, options: AbsolutePoseOptions
-) -> tuple[Array | None, int]:
-    """The best pose row (12,) of RANSAC, and the samples it took."""
+) -> Array | None:
+    """The best pose row (12,) of RANSAC."""
     rng = np.random.default_rng(options.seed)
     limit = options.max_error_px**2
     pose, best, inliers, trials = np.full(12, np.nan), np.inf, 0, 0
@@ -189,7 +166,7 @@ def _search(
         if found >= 0:
             inliers = found
         needed = trials_needed(inliers, len(rays), options.confidence)
-    return (pose if inliers >= options.min_num_inliers else None), trials
+    return pose if inliers >= options.min_num_inliers else None
 
 
 def _draw(rng: np.random.Generator, camera_idx: IndexArray) -> IndexArray:
@@ -218,7 +195,6 @@ def _refined(
     matches: Matches,
     rig: RigRows,
     options: AbsolutePoseOptions,
-    num_trials: int,
 ) -> RigPose | None:
     """Robust adjustment, then least squares on what the noise explains."""
     squares = np.empty(len(matches[1]))
@@ -250,7 +226,6 @@ def _refined(
         errors_px=np.sqrt(squares),
         noise_px=noise,
         covariance=covariance_from_hessian(hessian, noise),
-        num_trials=num_trials,
     )
 
 

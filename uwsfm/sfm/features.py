@@ -175,7 +175,7 @@ def _write_image(
         )
 
 
-def store_intrinsics(frames: Frames, rig: Rig, database_path: Path) -> None:
+def store_intrinsics(rig: Rig, database_path: Path) -> None:
     """Give the database's cameras the rig's intrinsics in air; features do not change.
 
     An interrupted run may leave several cameras for one folder: all are set.

@@ -216,7 +216,7 @@ def match_images(
         shutil.rmtree(space.work_dir / MATCHES, ignore_errors=True)
 
     key = steps.run("features", inputs, extract, outputs=[space.features], clear=forget)
-    store_intrinsics(frames, rig, space.features)
+    store_intrinsics(rig, space.features)
     # COLMAP's matches do not depend on the seed: another one must not repeat them.
     seeds = [options.seed] if options.matching.matcher == "paper" else []
     return steps.run(

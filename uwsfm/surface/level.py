@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from uwsfm.errors import InputError, UwsfmError
@@ -160,11 +159,6 @@ def find_level(
             "folder, whose cameras tell"
         )
     return level_by_plane(points, above)
-
-
-def rotation_of(level: Level) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) from the world to the map."""
-    return Rotation.from_quat(level.map_from_world[:4]).as_matrix()
 
 
 def world_from_map(level: Level) -> Array:
