@@ -10,6 +10,7 @@ from types import FrameType
 EXIT_CODE = 128 + signal.SIGTERM
 
 RESUMES = "the same command resumes the run"
+BEGINS_AGAIN = "the same command begins again"
 NOTHING_WRITTEN = "nothing was written"
 
 

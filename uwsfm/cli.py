@@ -301,7 +301,7 @@ def refine(
     """
     from uwsfm.console import ProgressBars
 
-    with ProgressBars("the same command begins again") as progress:
+    with ProgressBars(_signals.BEGINS_AGAIN) as progress:
         from uwsfm.refine_pipeline import refine_model as run
 
         result = run(

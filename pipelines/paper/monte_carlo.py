@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import uwsfm
+from uwsfm._signals import BEGINS_AGAIN
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.console import ProgressBars
 from uwsfm.geometry.rays import triangulate_tracks
@@ -42,7 +43,7 @@ def run_all(
     """
     # Kernels are compiled here once; the workers load them.
     warm_up()
-    with ProgressBars() as progress:
+    with ProgressBars(BEGINS_AGAIN) as progress:
         return workers.run(function, [(task,) for task in tasks], label, progress)
 
 

@@ -31,6 +31,7 @@ from pose_trials import PORTS, absolute_trial, relative_trial  # noqa: E402
 from tables import Row, markdown, read_csv, write_csv  # noqa: E402
 
 from uwsfm._files import replaced_file  # noqa: E402
+from uwsfm._signals import BEGINS_AGAIN  # noqa: E402
 from uwsfm.console import ProgressBars  # noqa: E402
 from uwsfm.tasks import LOCAL, Workers  # noqa: E402
 
@@ -56,7 +57,7 @@ def main() -> None:
     cases = list(product(PORTS, NOISES_PX))
     with (
         Workers(options.scheduler, options.out, options.processes) as workers,
-        ProgressBars() as progress,
+        ProgressBars(BEGINS_AGAIN) as progress,
     ):
         for name, function, runs, path in (
             ("absolute poses", absolute_rows, options.absolute, ABSOLUTE_CSV),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import uwsfm
+from uwsfm._signals import BEGINS_AGAIN
 from uwsfm.console import ProgressBars
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
@@ -333,7 +334,7 @@ def main() -> None:
     ]
     with (
         Workers(options.scheduler, options.out, options.processes) as workers,
-        ProgressBars() as progress,
+        ProgressBars(BEGINS_AGAIN) as progress,
     ):
         tasks = [(strip,) for strip in strips]
         rows = sum(workers.run(outcomes, tasks, "strips", progress), [])
