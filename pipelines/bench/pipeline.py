@@ -89,7 +89,7 @@ def all_sections(options: argparse.Namespace) -> Sections:
         )
     }
     for size in sizes:
-        sections[f"solver-{size}"] = partial(solve, size, folder)
+        sections[f"solver-{size}"] = partial(solve, size, sizes[0], folder)
     for size in peers:
         sections[f"colmap-{size}"] = partial(
             call, "peers", "pinhole_colmap", num_frames=size, folder=folder
@@ -121,15 +121,17 @@ def all_sections(options: argparse.Namespace) -> Sections:
     return sections
 
 
-def solve(num_frames: int, folder: str) -> dict[str, Any]:
+def solve(num_frames: int, smallest: int, folder: str) -> dict[str, Any]:
     """One size; simulating and compiling are left to other processes, for memory."""
-    call("surveys", "make", num_frames=num_frames, folder=folder)
+    for size in (num_frames, smallest):
+        call("surveys", "make", num_frames=size, folder=folder)
     for _ in range(MAX_TRIES):
         found = call(
             "solver",
             "measure",
             num_threads=2,
             num_frames=num_frames,
+            smallest=smallest,
             folder=folder,
         )
         if not found["compiled"]:

@@ -14,12 +14,14 @@ from numba.core import event
 from threadpoolctl import threadpool_limits
 
 from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.scene import Scene
 from uwsfm.solver import levenberg_marquardt, schur
-from uwsfm.solver.layout import Layout, build_layout
+from uwsfm.solver.layout import build_layout
 from uwsfm.solver.levenberg_marquardt import (
     LevenbergMarquardtOptions,
     LevenbergMarquardtResult,
     Problem,
+    Report,
     minimize,
 )
 from uwsfm.solver.state import State
@@ -46,10 +48,30 @@ _PLACES: tuple[tuple[str, Any, str], ...] = (
 WHERE_NEEDED = "settle points"
 """The only stage that a solve may do without."""
 MAX_ITERATIONS = 50
-Solve = Callable[[int], LevenbergMarquardtResult]
+SMALL_SOLVES = 5
+"""At a time, a fifth of a second or more, while a larger survey waits."""
 
 
-def measure(num_frames: int, folder: str) -> dict[str, Any]:
+class Solve:
+    """The adjustment of a survey from its start."""
+
+    def __init__(self, start: Scene) -> None:
+        columns = CalibrateOptions(loss="l2").border_columns(
+            start.cameras, np.zeros(len(start.cameras), dtype=bool)
+        )
+        clock = time.process_time()
+        self.layout = build_layout(start, columns)
+        self._state = State.from_scene(start)
+        self.sorting_s = time.process_time() - clock
+
+    def __call__(
+        self, max_iterations: int = MAX_ITERATIONS, report: Report | None = None
+    ) -> LevenbergMarquardtResult:
+        options = LevenbergMarquardtOptions(max_iterations=max_iterations)
+        return minimize(self.layout, self._state, options, report=report)
+
+
+def measure(num_frames: int, smallest: int, folder: str) -> dict[str, Any]:
     """Times, memory and convergence of one survey.
 
     Both solves run to their end: where they start, one cost and one linearisation come
@@ -57,26 +79,20 @@ def measure(num_frames: int, folder: str) -> dict[str, Any]:
 
     Args:
         num_frames: A size in `surveys.SPECS`.
+        smallest: That with which it takes turns.
         folder: Of the surveys.
     """
     truth = surveys.load(num_frames, folder)
     start = surveys.start_of(truth)
-    columns = CalibrateOptions(loss="l2").border_columns(
-        start.cameras, np.zeros(len(start.cameras), dtype=bool)
-    )
     before = peak_memory_mb()
     messages, compiled = _listen(), _count_compilations()
-    clock = time.process_time()
-    layout, state = build_layout(start, columns), State.from_scene(start)
-    sorting = time.process_time() - clock
-
-    def solve(max_iterations: int) -> LevenbergMarquardtResult:
-        options = LevenbergMarquardtOptions(max_iterations=max_iterations)
-        return minimize(layout, state, options)
-
-    one, result = _timed(solve, layout, num_threads=1)
+    solve = Solve(start)
+    one, result = _timed(solve, num_threads=1)
     peak = peak_memory_mb()
-    two, _ = _timed(solve, layout, num_threads=2)
+    growth = _over_smallest(
+        solve, Solve(surveys.start_of(surveys.load(smallest, folder)))
+    )
+    two, _ = _timed(solve, num_threads=2)
     if two["iterations"] != one["iterations"]:
         raise RuntimeError("two threads took another way than one")
     distances = result.state.ports[:, 3]
@@ -84,8 +100,10 @@ def measure(num_frames: int, folder: str) -> dict[str, Any]:
         "frames": start.num_frames,
         "points": start.num_points,
         "observations": start.num_observations,
-        "setup_s": sorting + one["structure_s"],
+        "setup_s": solve.sorting_s + one["structure_s"],
         "one_thread": one,
+        "smallest": smallest,
+        "over_smallest": growth,
         "two_threads": two,
         "peak_mb": peak,
         "peak_before_mb": before,
@@ -101,14 +119,48 @@ def measure(num_frames: int, folder: str) -> dict[str, Any]:
     }
 
 
+def _over_smallest(large: Solve, small: Solve) -> float:
+    """CPU per observation and iteration, over that of the smallest survey.
+
+    They take turns after every iteration: the speed of a machine that is shared changes
+    by the second.
+    """
+    times: list[float] = []
+
+    def wait() -> None:
+        times.extend(cpu_per_observation(small) for _ in range(SMALL_SOLVES))
+
+    with limited(1), threadpool_limits(1):
+        small(1)  # loads the kernels
+        return cpu_per_observation(large, wait) / float(np.mean(times))
+
+
+def cpu_per_observation(solve: Solve, wait: Callable[[], None] | None = None) -> float:
+    """CPU seconds per observation and iteration, less what it waits meanwhile."""
+    spent, begun = 0.0, None
+
+    def report(iteration: int, cost: float) -> None:
+        nonlocal spent, begun
+        if begun is not None:  # else the structure was found
+            spent += time.process_time() - begun
+        if wait is not None:
+            wait()
+        begun = time.process_time()
+
+    result = solve(report=report)
+    assert begun is not None
+    spent += time.process_time() - begun
+    return spent / result.num_iterations / len(solve.layout.xy)
+
+
 def _timed(
-    solve: Solve, layout: Layout, num_threads: int
+    solve: Solve, num_threads: int
 ) -> tuple[dict[str, Any], LevenbergMarquardtResult]:
     with limited(num_threads), threadpool_limits(num_threads):
         solve(1)  # loads the kernels and touches the memory
         with stopwatch() as clocks:
             wall, cpu = time.perf_counter(), time.process_time()
-            result = solve(MAX_ITERATIONS)
+            result = solve()
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     count = result.num_iterations
     # Found once, however many iterations there are.
@@ -119,7 +171,7 @@ def _timed(
         "structure_s": clocks["cpu_s"]["structure"],
         "wall_s": wall / count,
         "cpu_s": cpu / count,
-        "cpu_us_per_observation": 1e6 * cpu / count / len(layout.xy),
+        "cpu_us_per_observation": 1e6 * cpu / count / len(solve.layout.xy),
     }
     for kind, total in (("wall_s", wall), ("cpu_s", cpu)):
         stages = _exclusive(clocks[kind], total)
