@@ -96,28 +96,44 @@ class _SharedCache(FunctionCache):
             super().save_overload(*args)
 
 
-class _ClosedLibrary(JITCodeLibrary):
-    """Machine code of a kernel, in which what it calls is its own.
+class _Library(JITCodeLibrary):
+    """Machine code of one function."""
 
-    Numba's is open: a process that compiles calls the functions that were compiled for
-    themselves, one that loads calls the copies beside the kernel, and as sums may be
-    regrouped, their last digits differed.
-    """
+    closed = False
+    """Whether what it calls is its own. Numba's are open: a process that compiles calls
+    the functions that were compiled for themselves, one that loads calls the copies
+    beside the kernel, and as sums may be regrouped, their last digits differed."""
+    straight = False
+    """Whether straight lines become SIMD by LLVM's SLP. Numba leaves it out, and lanes
+    have to: it would undo them."""
+
+    def _optimize_final_module(self) -> None:
+        before = config.SLP_VECTORIZE  # type: ignore[attr-defined]
+        config.SLP_VECTORIZE = int(self.straight)  # type: ignore[attr-defined]
+        try:  # compilers have a lock: one at a time
+            super()._optimize_final_module()
+        finally:
+            config.SLP_VECTORIZE = before  # type: ignore[attr-defined]
 
     def _finalize_final_module(self) -> None:
         for function in self._final_module.functions:
-            if function.linkage == Linkage.linkonce_odr:
+            if self.closed and function.linkage == Linkage.linkonce_odr:
                 function.linkage = Linkage.internal
         super()._finalize_final_module()
 
 
-class _KernelCompiler(Compiler):
-    def define_pipelines(self) -> list[Any]:
-        state = self.state
-        codegen, name = state.targetctx.codegen(), state.func_id.func_qualname
-        state.library = _ClosedLibrary(codegen, name)
-        state.library.enable_object_caching()
-        return super().define_pipelines()
+def _compiler(*, closed: bool, straight: bool) -> type[Compiler]:
+    library = type("Library", (_Library,), {"closed": closed, "straight": straight})
+
+    class KernelCompiler(Compiler):
+        def define_pipelines(self) -> list[Any]:
+            state = self.state
+            codegen, name = state.targetctx.codegen(), state.func_id.func_qualname
+            state.library = library(codegen, name)
+            state.library.enable_object_caching()
+            return super().define_pipelines()
+
+    return KernelCompiler
 
 
 class _Dispatcher(CPUDispatcher):
@@ -150,14 +166,23 @@ def inner(function: Function) -> Function:
     return _compiled(function, _InnerDispatcher)
 
 
-def fused(function: Function) -> Function:
-    """Compile a kernel whose sums may be regrouped, as those of lanes are."""
-    return _compiled(function, _Dispatcher, fastmath=_LANE_MATH)
+def straight(function: Function) -> Function:
+    """Compile a kernel of small blocks, whose straight lines of sums become SIMD.
+
+    As many of them as fit, where all is loaded before it is stored, and the last index
+    is a literal: others may be negative, and then their neighbours are elsewhere.
+    """
+    return _compiled(function, _Dispatcher, straight=True, fastmath=_LANE_MATH)
 
 
 def inner_fused(function: Function) -> Function:
     """Compile a kernel that only kernels call, and whose sums may be regrouped."""
     return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH)
+
+
+def inner_straight(function: Function) -> Function:
+    """Compile a `straight` kernel that only kernels call."""
+    return _compiled(function, _InnerDispatcher, straight=True, fastmath=_LANE_MATH)
 
 
 def lane(function: Function) -> Function:
@@ -169,10 +194,16 @@ def lane(function: Function) -> Function:
     return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH, forceinline=True)
 
 
-def _compiled(function: Function, dispatcher: type[_Dispatcher], **options: Any) -> Any:
-    options["no_cpython_wrapper"] = issubclass(dispatcher, _InnerDispatcher)
-    if dispatcher is _Dispatcher:
-        options["pipeline_class"] = _KernelCompiler
+def _compiled(
+    function: Function,
+    dispatcher: type[_Dispatcher],
+    *,
+    straight: bool = False,
+    **options: Any,
+) -> Any:
+    is_inner = issubclass(dispatcher, _InnerDispatcher)
+    options["no_cpython_wrapper"] = is_inner
+    options["pipeline_class"] = _compiler(closed=not is_inner, straight=straight)
     made: Any = numba.njit(**_OPTIONS, **options)(function)
     if isinstance(made, CPUDispatcher):  # not where compilation is turned off
         made.__class__ = dispatcher

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import fused, inner_fused, lane
+from uwsfm._jit import inner_fused, lane, straight
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.block_graph import BlockGraph, find_block
 from uwsfm.solver.layout import HELD, Layout
@@ -65,7 +65,7 @@ def invert_damped(block, damping, inverse):
     return True
 
 
-@fused
+@straight
 def invert_points(eqs, damping, first, last, inverses, border, right):
     """Invert the damped blocks of some points, and take them out of the border.
 
@@ -234,7 +234,7 @@ def _fill_rows(graph, eqs, damping, first, last, system):
                 coupling[i, k, a] = eqs.frames_border[f, a, k]
 
 
-@fused
+@straight
 def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
     """Sum the rows of some frames.
 
@@ -270,7 +270,7 @@ def eliminate_rows(point_start, graph, eqs, damping, first, last, system):
                 )
 
 
-@fused
+@straight
 def substitute_points(
     point_start, graph, eqs, inverses, frames_step, border_step, first, last, out
 ):
