@@ -186,10 +186,11 @@ def inner_straight(function: Function) -> Function:
 
 
 def lane(function: Function) -> Function:
-    """Compile a formula of one lane, or a loop over lanes, for SIMD; inner.
+    """Compile what becomes part of its caller.
 
-    It becomes part of its caller, else the caller's loop would not vectorise: keep it
-    free of branches (min, max, `x if ok else y`), inner loops and arrays of any length.
+    A formula of one lane, or a loop over lanes: else the caller's loop would not become
+    SIMD; keep it free of branches (min, max, `x if ok else y`), inner loops and arrays
+    of any length. Or what is short and called with many arrays, which a call copies.
     """
     return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH, forceinline=True)
 

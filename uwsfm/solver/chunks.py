@@ -27,10 +27,12 @@ from uwsfm.residuals.reprojection_lanes import (
 from uwsfm.scene import IndexArray
 from uwsfm.solver.lane_products import (
     CELL,
+    COUPLE,
     RES_U,
     RES_V,
     multiply_camera,
     multiply_cells,
+    num_fours,
     weigh,
 )
 from uwsfm.solver.layout import Layout
@@ -39,17 +41,19 @@ from uwsfm.solver.losses import CAUCHY, INVALID_PX
 CHUNK: Final = 512
 """Observations, unless one point has more."""
 
-# Columns of a row: H (6, lower triangle) and g (3) by the point in the rig, then the
-# coupling (3) to each free parameter of the camera.
+ROW: Final = 9
+"""Columns of a row: H (6, lower triangle) and g (3) by the point in the rig."""
 GRAD: Final = 6
-COUPLING: Final = 9
 
 
 class Chunk(NamedTuple):
     """Scratch for one chunk of at most M observations by C cameras."""
 
     rows: Array
-    """(M, COUPLING + 3 W) weighted products; zero where invalid."""
+    """(M, ROW) weighted products; zero where invalid."""
+    fours: Array
+    """(M, 3 fours of W, 4): x coupled to the free parameters of the camera, in as many
+    fours as it has; then y, and z."""
     errors: Array
     """(M, 2) residuals in pixels, NaN where invalid."""
     in_rig: Array
@@ -85,16 +89,17 @@ def largest_chunk(layout: Layout) -> int:
 def new_chunk(layout: Layout, largest: int) -> Chunk:
     """Scratch for chunks of a layout, of at most so many observations."""
     num_cameras = len(layout.free_start) - 1
-    columns = COUPLING + 3 * width(layout)
+    fours = 3 * num_fours(width(layout))
     return Chunk(
-        rows=np.zeros((largest, columns)),
+        rows=np.zeros((largest, ROW)),
+        fours=np.zeros((largest, fours, 4)),
         errors=np.empty((largest, 2)),
         in_rig=np.empty((largest, 3)),
         bucket=np.empty((num_cameras, largest), dtype=np.int64),
         counts=np.empty(num_cameras, dtype=np.int64),
         columns=_columns(layout),
         buffer=np.empty(SIZE),
-        products=np.empty((CELL + columns) * STRIDE),
+        products=np.empty((COUPLE + 4 * fours) * STRIDE),
         j_lens=np.empty((2, NUM_PARAMS)),
         j_port=np.empty((2, JAC_SIZE)),
         j_rig=np.empty((2, 3)),
@@ -181,15 +186,16 @@ def evaluate(layout, state, first, chunk):
 
 @inner
 def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
-    """Products of residuals and Jacobians of a gathered chunk into ``rows``.
+    """Products of residuals and Jacobians of a gathered chunk: ``rows``, ``fours``.
 
     Args:
         sums: (C, W, W + 1), added to: each camera against the residual and itself.
     """
     buffer, products = chunk.buffer, chunk.products
-    rows, bucket = chunk.rows, chunk.bucket
+    rows, fours, bucket = chunk.rows, chunk.fours, chunk.bucket
     for k in range(len(chunk.counts)):
         num_free = layout.free_start[k + 1] - layout.free_start[k]
+        num_rows = 3 * num_fours(num_free)
         for start in range(0, chunk.counts[k], BLOCK):
             count = min(BLOCK, chunk.counts[k] - start)
             _load(chunk, k, start, count)
@@ -203,8 +209,11 @@ def evaluate_with_jac(layout, state, first, loss, scale, sums, chunk):
             multiply_camera(chunk.columns[k], num_free, sums[k], buffer, products)
             for i in range(count):
                 j = bucket[k, start + i]
-                for a in range(COUPLING + 3 * num_free):
+                for a in range(ROW):
                     rows[j, a] = products[(CELL + a) * STRIDE + i]
+                for s in range(num_rows):
+                    for t in range(4):
+                        fours[j, s, t] = products[(COUPLE + 4 * s + t) * STRIDE + i]
 
 
 @inner

@@ -1,12 +1,14 @@
 """Products of weighted Jacobians over lanes: what a cell and a camera sum up.
 
 Beside the buffer of `uwsfm.models.lanes`, a second one of the same lanes holds the
-weight, then J^T W J and J^T W r by the point in the rig, then its coupling to each of
-the camera's free parameters, three rows each.
+weight, then J^T W J and J^T W r by the point in the rig, then its coupling to the
+camera's free parameters: the rows of x to all of them, in fours, then those of y and z.
 """
 
 import math
 from typing import Final
+
+from numba.extending import register_jitable
 
 from uwsfm._jit import inner_fused, lane
 from uwsfm.models.lanes import BLOCK, JAC_U, JAC_V, STRIDE
@@ -18,6 +20,12 @@ CELL: Final = 1
 """H: 00, 10, 11, 20, 21, 22, then g: 0, 1, 2."""
 COUPLE: Final = 10
 RES_U, RES_V = JAC_U + RESIDUAL, JAC_V + RESIDUAL
+
+
+@register_jitable
+def num_fours(num_columns: int) -> int:
+    """That so many columns fill, the last one perhaps not."""
+    return -(-num_columns // 4)
 
 
 @inner_fused
@@ -80,19 +88,20 @@ def _dots(one, c0, c1, c2, c3, buffer, products):
 
 
 @lane
-def _couple(column, row, buffer, products):
-    """Three rows: products of a weighted column with those by the point."""
+def _couple(column, row, fours, buffer, products):
+    """Three rows, ``fours`` apart: products of a weighted column with the point's."""
     u, v = buffer[(JAC_U + column) * STRIDE :], buffer[(JAC_V + column) * STRIDE :]
     rig_u, rig_v = (JAC_U + RIG) * STRIDE, (JAC_V + RIG) * STRIDE
     weight, out = products[WEIGHT * STRIDE :], products[row * STRIDE :]
+    second, third = out[fours * STRIDE :], out[2 * fours * STRIDE :]
     for i in range(BLOCK):
         a, b = weight[i] * u[i], weight[i] * v[i]
         c0 = a * buffer[rig_u + i] + b * buffer[rig_v + i]
         c1 = a * buffer[rig_u + STRIDE + i] + b * buffer[rig_v + STRIDE + i]
         c2 = a * buffer[rig_u + 2 * STRIDE + i] + b * buffer[rig_v + 2 * STRIDE + i]
         out[i] = c0
-        out[STRIDE + i] = c1
-        out[2 * STRIDE + i] = c2
+        second[i] = c1
+        third[i] = c2
 
 
 @inner_fused
@@ -104,7 +113,7 @@ def multiply_camera(columns, num_free, sums, buffer, products):
         num_free: how many these are.
         sums: (W, W + 1) lower triangle, added to.
     """
-    last = num_free
+    last, fours = num_free, 4 * num_fours(num_free)
     for s in range(num_free):
         one = columns[s + 1]
         for t in range(0, s + 2, 4):  # four at a time hide the cost of adding lanes up
@@ -114,4 +123,8 @@ def multiply_camera(columns, num_free, sums, buffer, products):
             )
             for k in range(min(4, s + 2 - t)):
                 sums[s, t + k] += dots[k]
-        _couple(one, COUPLE + 3 * s, buffer, products)
+        _couple(one, COUPLE + s, fours, buffer, products)
+    for s in range(num_free, fours):
+        for k in range(3):
+            row = (COUPLE + k * fours + s) * STRIDE
+            products[row : row + BLOCK] = 0.0

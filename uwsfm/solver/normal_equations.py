@@ -17,7 +17,17 @@ from uwsfm._jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig
-from uwsfm.solver.assembly import Sums, add_cell, assemble, clear, rotation
+from uwsfm.solver.assembly import (
+    NOTHING,
+    Sums,
+    add_cell,
+    add_frames,
+    assemble,
+    clear,
+    plus,
+    rotation,
+    write_point,
+)
 from uwsfm.solver.cells import (
     add_point_3d,
     add_virtual_camera,
@@ -136,13 +146,14 @@ def _work(num_border, num_cameras, largest_cell):
 
 
 @kernel
-def _linearize_in_space(layout, state, error, loss, scale, out):
+def _linearize_in_space(layout, state, error, loss, scale, turns, moves, out):
     """`linearize` of errors that are not in the image, cell by cell."""
     # A camera may have matched two features of an image to one point.
     largest_cell = np.diff(layout.cell_start).max()
     work = _work(len(out.border_grad), len(state.cams), largest_cell)
     hess, grad = work.hess, work.grad
     for p in range(len(layout.point_start) - 1):
+        total = NOTHING
         for c in range(layout.point_start[p], layout.point_start[p + 1]):
             f = layout.cell_frame[c]
             frame = state.frames[f]
@@ -155,22 +166,10 @@ def _linearize_in_space(layout, state, error, loss, scale, out):
             lower = (hess[0, 0], hess[1, 0], hess[1, 1], hess[2, 0], hess[2, 1])
             cell = (*lower, hess[2, 2], grad[0], grad[1], grad[2])
             turn = rotation(state.frames, f)
-            add_cell(
-                x,
-                y,
-                z,
-                turn,
-                p,
-                c,
-                f,
-                cell,
-                out.frames,
-                out.frames_grad,
-                out.cells,
-                out.points_grad,
-                out.points,
-            )
+            given = add_cell(x, y, z, turn, c, f, cell, turns, moves, out.cells)
+            total = plus(total, given)
             _add_couplings(x, y, z, frame, p, f, work.couple, out)
+        write_point(p, total, out.points, out.points_grad)
     scatter_blocks(layout, work, out)
 
 
@@ -190,10 +189,10 @@ def scatter(layout: Layout, parts: list[Sums], out: NormalEquations) -> None:
     """Sum parts up in their order; cameras may share border columns."""
     cameras = layout.num_camera_cols
     for sums in parts:
-        out.frames[sums.seen] += sums.frames
-        out.frames_grad[sums.seen] += sums.frames_grad
-        of_frames = np.swapaxes(sums.frames_border, 1, 2)
-        out.frames_border[sums.seen, :, :cameras] += of_frames
+        add_frames(sums.seen, sums.turns, sums.moves, out.frames, out.frames_grad)
+        chosen = sums.column.reshape(-1, 1) == np.arange(cameras)
+        slots = sums.slots.reshape(len(sums.seen), 6, -1)
+        out.frames_border[sums.seen, :, :cameras] += slots @ chosen
     blocks = np.sum([sums.blocks for sums in parts], axis=0)
     for k in range(len(layout.free_start) - 1):
         cols = layout.free_col[layout.free_start[k] : layout.free_start[k + 1]]
@@ -217,7 +216,10 @@ def linearize(
         if not name.startswith(_WRITTEN if in_image else _WRITTEN[:1]):
             block[...] = 0.0
     if not in_image:
-        _linearize_in_space(work.layout, state, error, loss, scale, out)
+        num_frames = len(out.frames)
+        turns, moves = np.zeros((num_frames, 3, 6)), np.zeros((num_frames, 12))
+        _linearize_in_space(work.layout, state, error, loss, scale, turns, moves, out)
+        add_frames(np.arange(num_frames), turns, moves, out.frames, out.frames_grad)
         return
 
     def add_part(part: int) -> None:

@@ -113,7 +113,7 @@ def _rows(cells, c):
     )
 
 
-@inner_fused
+@lane
 def _fold_cell(cells, inverses, grads, c, p, i, folded, right):
     """W V^-1 (6, 3) of one cell, and its part of the right side of row i."""
     v00, v01, v02 = inverses[p, 0, 0], inverses[p, 0, 1], inverses[p, 0, 2]
@@ -181,7 +181,7 @@ def _subtract_cross(values, i, k, y, c, z, b):
     values[i, k, 3], values[i, k, 4], values[i, k, 5] = b3, b4, b5
 
 
-@inner_fused
+@lane
 def _subtract_border(borders, p, i, folded, coupling):
     """Coupling (B, 6) of row i -= E^T (W V^-1)^T."""
     columns = _columns(folded)
@@ -190,7 +190,7 @@ def _subtract_border(borders, p, i, folded, coupling):
         _subtract(coupling, i, k, _line(columns, w0, w1, w2))
 
 
-@inner_fused
+@lane
 def _subtract_products(
     row_start, row_other, cell_row, first, last, i, cells, folded, blocks
 ):

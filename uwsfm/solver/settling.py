@@ -10,13 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwsfm._jit import inner_fused, kernel
+from uwsfm._jit import inner_straight, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.solver.assembly import (
-    add_to_point,
+    NOTHING,
+    plus,
+    point_sums,
     rotation,
     sum_rows,
     times_rotation,
+    write_point,
 )
 from uwsfm.solver.chunks import chunk_end, evaluate_with_jac, gather
 from uwsfm.solver.schur import invert_damped
@@ -25,14 +28,14 @@ from uwsfm.solver.threads import run_chunks
 from uwsfm.solver.workspace import Workspace
 
 
-@inner_fused
+@inner_straight
 def _move_points(layout, poses, first_point, last_point, first, rows, damping, points):
     """Points of an evaluated chunk; those that their rays do not fix stay."""
     point_start, cell_start = layout.point_start, layout.cell_start
     cell_frame, one = layout.cell_frame, np.int64(0)
     hess, grad, inverse = np.empty((1, 3, 3)), np.empty((1, 3)), np.empty((3, 3))
     for p in range(first_point, last_point):
-        hess[:], grad[:] = 0.0, 0.0
+        total = NOTHING
         for c in range(point_start[p], point_start[p + 1]):
             start, end = cell_start[c] - first, cell_start[c + 1] - first
             h00, h10, h11, h20, h21, h22, g0, g1, g2 = sum_rows(rows, start, end)
@@ -40,7 +43,8 @@ def _move_points(layout, poses, first_point, last_point, first, rows, damping, p
             a = times_rotation(h00, h10, h20, frame)
             b = times_rotation(h10, h11, h21, frame)
             d = times_rotation(h20, h21, h22, frame)
-            add_to_point(one, frame, a, b, d, g0, g1, g2, grad, hess)
+            total = plus(total, point_sums(frame, a, b, d, g0, g1, g2))
+        write_point(one, total, hess, grad)
         if invert_damped(hess[0], damping, inverse):
             for k in range(3):
                 points[p, k] -= (

@@ -21,7 +21,7 @@ from uwsfm.solver.threads import chunk_bounds
 PART = 20_000
 """Observations that are worth a thread: two milliseconds."""
 MAX_PARTS = 16
-"""Each needs sums of its own, 6 (7 + B) numbers for every frame that it sees."""
+"""Each needs sums of its own, 30 + 6 S numbers for every frame that it sees."""
 
 
 class Workspace:
