@@ -4,6 +4,7 @@ import re
 from importlib import import_module
 from types import ModuleType
 
+from uwsfm._signals import interruption_in
 from uwsfm.errors import MissingPackageError
 
 _DISTRIBUTIONS = {"rerun": "rerun-sdk"}
@@ -27,8 +28,9 @@ def import_package(name: str, purpose: str, extra: str) -> ModuleType:
     try:
         return import_module(name)
     except (ImportError, OSError) as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # pybind11 wraps it
-            raise error.__cause__ from None
+        interruption = interruption_in(error)
+        if interruption is not None:
+            raise interruption from None
         package = _DISTRIBUTIONS.get(name, name)
         library = _NO_LIBRARY.search(str(error))
         if library is not None:

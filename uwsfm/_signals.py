@@ -37,6 +37,17 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
+def interruption_in(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The interruption that an error is or hides.
+
+    A signal that comes in native code is raised there: numba and pybind11 make another
+    error of it, with it as the cause.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def tell_interrupted(left: str) -> None:
     """The sentence: what an interrupted command leaves."""
     print(f"interrupted; {left}", file=sys.stderr)
@@ -48,6 +59,9 @@ def interruptible() -> Iterator[None]:
     raise_on_sigterm()
     try:
         yield
-    except KeyboardInterrupt:
+    except BaseException as error:
+        interruption = interruption_in(error)
+        if interruption is None:
+            raise
         tell_interrupted(NOTHING_WRITTEN)
-        raise
+        raise interruption from None

@@ -19,7 +19,12 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from uwsfm._signals import RESUMES, raise_on_sigterm, tell_interrupted
+from uwsfm._signals import (
+    RESUMES,
+    interruption_in,
+    raise_on_sigterm,
+    tell_interrupted,
+)
 
 if TYPE_CHECKING:
     from uwsfm.batch import Outcome
@@ -54,13 +59,15 @@ class ProgressBars:
         raise_on_sigterm()
         return self
 
-    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, _: object, failure: BaseException | None, *__: object) -> None:
         if failure is None:
             self._finish_others("")
         if self._tasks:  # else a blank line would be drawn
             self._progress.stop()
-        if failure is not None and issubclass(failure, KeyboardInterrupt):
+        interruption = interruption_in(failure)
+        if interruption is not None:
             tell_interrupted(self._left)
+            raise interruption from None
 
     def __call__(self, step: str, done: int, total: int | None) -> None:
         if not self._tasks:

@@ -8,6 +8,7 @@ from typing import Any
 
 from uwsfm._files import replaced_dir, replaced_file
 from uwsfm._progress import Progress, silent
+from uwsfm._signals import interruption_in
 from uwsfm.calibration.problem import CalibrationResult, Covariance
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
@@ -64,6 +65,8 @@ def write_with_report(
     try:
         write_files(out, model, calibration.covariance, summary)
     except Exception as error:  # whatever it is, the result is worth more
+        if interruption_in(error) is not None:
+            raise
         _remove(out)
         why = f"{error}" if isinstance(error, InputError) else repr(error)
         summary["warnings"].append(f"the report could not be written: {why}")
