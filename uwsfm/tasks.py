@@ -33,12 +33,23 @@ LOCAL = "local"
 RETRIES = 2
 """Of a task that fails for another reason than its input: a full disk, say."""
 CONNECT_SECONDS = 5
-ORPHANED = "30s"
-"""Without a task, after which processes of this machine end: whoever started them was
-killed."""
-OWN_GROUP = "import os; os.setpgrp()"
-"""Ctrl-C and `timeout` mean whole groups: this process is to end the others, in order,
-before they complain of each other."""
+ENDS_WITH_PARENT = """
+import os, signal, threading, time
+
+def watch():
+    while os.getppid() == {parent}:
+        time.sleep(1.0)
+    os.killpg(0, signal.SIGKILL)
+
+os.setpgrp()
+threading.Thread(target=watch, daemon=True).start()
+"""
+"""What the processes of this machine run first.
+
+A group of their own: Ctrl-C and `timeout` mean whole groups; this process is to end the
+others, in order, before they complain of each other. When it is killed, nobody does,
+and a worker in the midst of a task would keep the lock of an output folder.
+"""
 BYTES_PER_WORKER = 1.5e9
 """That a submap of 200 frames with 4000 features per image needs at its peak, about."""
 
@@ -188,16 +199,16 @@ class Workers:
             "local_directory": scratch,
             "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
         }
+        preload = [ENDS_WITH_PARENT.format(parent=os.getpid())]
         with _quiet_starts(), dask.config.set({"temporary-directory": scratch}):
             if sys.platform == "win32":  # where processes can only be spawned
                 cluster = LocalCluster(**common, **each)
             else:
                 cluster = SubprocessCluster(
                     **common,
-                    worker_kwargs={**each, "preload_nanny": [OWN_GROUP]},
+                    worker_kwargs={**each, "preload_nanny": preload},
                     scheduler_kwargs={
-                        "preload": [OWN_GROUP],
-                        "idle_timeout": ORPHANED,
+                        "preload": preload,
                         "local_directory": scratch,
                         # Dask removes it at its end, if it gets there: our folder is.
                         "scheduler_file": os.path.join(scratch, "scheduler.json"),
