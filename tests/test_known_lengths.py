@@ -3,7 +3,8 @@
 import pytest
 from dense import small_scene
 
-from uwsfm import InputError
+from uwsfm import InputError, calibrate
+from uwsfm.geometry import rigid3
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.lengths_file import load_positions
 from uwsfm.simulate.rigs import sample_rig
@@ -36,6 +37,24 @@ def test_a_distance_that_the_baseline_contradicts_grossly_is_refused(tmp_path):
     known = KnownLengths.read(path, None, None)
     with pytest.raises(InputError, match="500 m, but by the rig's baseline these"):
         known.placed(sample_rig(), names, scene)
+
+
+def test_positions_in_millimetres_are_refused_by_the_name_of_their_file(tmp_path):
+    path = tmp_path / "nav.csv"
+    names = [f"{i}.png" for i in range(4)]
+    scene = small_scene(4, 60).truth
+    places = 1e3 * rigid3.inverse(scene.rig_from_world)[:, 4:]
+    path.write_text(
+        HEADER
+        + "".join(
+            f"{name},{x},{y},{z},1,1,1\n"
+            for name, (x, y, z) in zip(names, places, strict=True)
+        )
+    )
+    known = KnownLengths.read(None, path, None)
+    scene, lengths = known.placed(sample_rig(), names, scene)
+    with pytest.raises(InputError, match=r"nav\.csv: the positions are 1000 times"):
+        calibrate(scene, lengths=lengths)
 
 
 def test_degrees_near_a_meridian_and_at_one_depth_are_degrees(tmp_path):

@@ -205,7 +205,10 @@ CSV_PROBLEMS = {
     + "".join(f"{i},8.9{i},44.4001,{i},1,1,1\n" for i in range(3)).replace(
         "8.9", "8.9000"
     ): "if 8.9000 and 44.4001 are degrees",
-    HEADER + "".join(f"{i},{i},4900000,0,1,1,1\n" for i in range(3)): "not of a local",
+    HEADER + "".join(f"{i},{i},4900000,0,1,1,1\n" for i in range(3)): (
+        "up to 4900000 m are not of a local"
+    ),
+    HEADER + "".join(f"{i},{i},1e300,0,1,1,1\n" for i in range(3)): "up to 1e+300 m",
 }
 
 

@@ -218,13 +218,13 @@ def test_mirrored_axes_are_no_outliers(rig, mistake, frames, rng):
     wrong = found[:, how] if isinstance(how[0], int) else found * how
     for places in (found, wrong):
         known = Positions.from_arrays(
-            frames, places[frames], np.full(3, NAV_STDDEV), ARM
+            frames, places[frames], np.full(3, NAV_STDDEV), ARM, "nav.csv"
         )
         lengths = Lengths(positions=known)
         if places is found:
             assert calibrate(scene, lengths=lengths).positions.num_outliers == 0
         else:
-            with pytest.raises(InputError, match="the axes of the positions are mirr"):
+            with pytest.raises(InputError, match="nav.csv: the axes of the positions"):
                 calibrate(scene, lengths=lengths)
 
 
@@ -258,7 +258,9 @@ def test_lengths_that_fit_nothing_are_refused(rng):
     simulated = dive(paper_rig(), rich_motion(8), num_points=100)
     scene = simulated.scene
     found, _ = tracked(simulated.truth, rng)
-    with pytest.raises(InputError, match="0.001 times as far apart"):
+    with pytest.raises(
+        InputError, match="positions: the positions are .* times as far apart"
+    ):
         calibrate(scene, lengths=positions(1e-3 * found, stddev=1e-5))
     few = Positions.from_arrays([0, 1, 1], found[:3], np.full(3, 0.1))
     with pytest.raises(InputError, match="at least 3 different frames"):

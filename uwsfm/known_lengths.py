@@ -151,6 +151,7 @@ class KnownLengths:
             table.positions[rows],
             table.stddevs[rows],
             self.lever_arm,
+            table.source,
         )
 
     def _check_distances(self, known: Distances, scene: Scene) -> None:

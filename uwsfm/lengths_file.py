@@ -203,6 +203,6 @@ def _check_units(path: Path, positions: Array) -> None:
     largest = float(np.abs(positions).max())
     if largest > LARGEST_M:
         raise InputError(
-            f"{path}: coordinates up to {largest:.0f} m are not of a local frame: "
+            f"{path}: coordinates up to {largest:.7g} m are not of a local frame: "
             "subtract a constant, for files in single precision would round them"
         )

@@ -72,6 +72,8 @@ class Positions:
     """(M, 3, 3)"""
     lever_arm: Array
     """(3,) the antenna in the rig's frame, that of the first camera."""
+    source: str = "positions"
+    """The file that they are from, for messages."""
 
     @classmethod
     def from_arrays(
@@ -80,11 +82,12 @@ class Positions:
         positions: ArrayLike,
         covariances: ArrayLike,
         lever_arm: ArrayLike = (0.0, 0.0, 0.0),
+        source: str = "positions",
     ) -> "Positions":
         """Check the arrays.
 
         Args:
-            frame_idx, positions, lever_arm: as in the class.
+            frame_idx, positions, lever_arm, source: as in the class.
             covariances: (M, 3, 3), or standard deviations (M, 3), or one (3,) for all.
 
         Raises:
@@ -117,6 +120,7 @@ class Positions:
             positions=places,
             covariances=spread,
             lever_arm=arm,
+            source=source,
         )
 
 

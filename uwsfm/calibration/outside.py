@@ -212,7 +212,8 @@ class Outside:
             InputError: they agree with the images as a mirror image only.
             UwsfmError: fewer than three agree.
         """
-        if not self.navigation:
+        known = self.lengths.positions
+        if known is None:
             return False
         if self.robust:
             require_right_handed(
@@ -232,8 +233,9 @@ class Outside:
         self.robust = False
         if np.count_nonzero(self.inliers) < 3:
             raise UwsfmError(
-                f"{np.count_nonzero(self.inliers)} of {len(squares)} positions agree "
-                "with the images: check their axes, the lever arm and the frame names"
+                f"{known.source}: {np.count_nonzero(self.inliers)} of {len(squares)} "
+                "positions agree with the images: check their axes, the lever arm and "
+                "the frame names"
             )
         return not (
             before[0] is False

@@ -99,12 +99,14 @@ def require_right_handed(
     Raises:
         InputError: the positions fit as a mirror image, and not as they are.
     """
+    known = lengths.positions
+    assert known is not None
     if fits_mirrored(*_matched(rig_from_world, lengths), with_scale=with_scale):
         raise InputError(
-            "the axes of the positions are mirrored: with two of x, y, z swapped, or "
-            "the sign of one changed, they fit the images, and as they are they do "
-            "not; give a right-handed frame, such as east, north, up or north, east, "
-            "down"
+            f"{known.source}: the axes of the positions are mirrored: with two of x, "
+            "y, z swapped, or the sign of one changed, they fit the images, and as "
+            "they are they do not; give a right-handed frame, such as east, north, up "
+            "or north, east, down"
         )
 
 
@@ -122,8 +124,8 @@ def require_metres(scene: Scene, lengths: Lengths) -> None:
     wrong = not 1.0 / WRONG_UNITS < scale < WRONG_UNITS
     if wrong and spread > 10.0 * noise:
         raise InputError(
-            f"the positions are {scale:.3g} times as far apart as the frames of "
-            "the model: they, or the baseline of the rig, are not in metres"
+            f"{known.source}: the positions are {scale:.4g} times as far apart as the "
+            "frames of the model: they, or the baseline of the rig, are not in metres"
         )
 
 
