@@ -1,6 +1,7 @@
 """Pictures of the results."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -54,35 +55,46 @@ def _kernels(results: Results, path: Path) -> None:
 
 
 def _solver(results: Results, path: Path) -> None:
-    """Time per observation against the size, split by stage; and the peer."""
+    """Time per observation against the size, split by stage; and the peer.
+
+    Only what took turns is compared: each size with the smallest, the peer with ours.
+    """
     sizes = solved_sizes(results)
     frames = [one["frames"] for one in sizes]
-    parts = np.array(
-        [
-            [
-                1e6 * one["one_thread"]["stages_cpu_s"][stage] / one["observations"]
-                for one in sizes
-            ]
-            for stage in SOLVER_STAGES
-        ]
-    )
-    figure, axes = plt.subplots(figsize=(8, 4))
+    base = _us(sizes[0]) / sizes[0]["over_smallest"]
+    total = np.array([base * one["over_smallest"] for one in sizes])
+    shares = [
+        [one["one_thread"]["stages_cpu_s"][stage] for one in sizes]
+        for stage in SOLVER_STAGES
+    ]
+    parts = total * np.array(shares) / np.sum(shares, axis=0)
+    figure, axes = plt.subplots(figsize=(9, 4))
     axes.stackplot(frames, parts, labels=SOLVER_STAGES, alpha=0.8)
-    total = parts.sum(axis=0)
-    axes.plot(frames, total, "k.-")
-    axes.axhline(1.5 * total[0], color="k", ls="--", label="1.5 x the smallest size")
+    axes.plot(frames, total, "k.-", label="all")
+    smallest = sizes[0]["smallest"]
+    axes.axhline(1.5 * base, color="k", ls="--", label=f"1.5 x {smallest} frames")
     peers = [
-        (one["frames"], results[f"colmap-{one['frames']}"]["us_per_observation"])
-        for one in sizes
-        if f"colmap-{one['frames']}" in results
+        (
+            one["frames"],
+            us * found["us_per_observation"] / found["ours_us_per_observation"],
+        )
+        for one, us in zip(sizes, total, strict=True)
+        if (found := results.get(f"colmap-{one['frames']}"))
     ]
     if peers:
         axes.plot(*zip(*peers, strict=True), "rs-", label="COLMAP, pinholes")
     axes.set_xscale("log")
+    axes.set_xticks(frames, [f"{count}" for count in frames])
+    axes.minorticks_off()
     axes.set_xlabel("frames of two cameras")
     axes.set_ylabel("us of CPU per observation and iteration")
-    axes.legend(fontsize="small")
+    axes.set_title(results["machine"]["cpu"], fontsize="small")
+    axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     _save(figure, path)
+
+
+def _us(one: dict[str, Any]) -> float:
+    return float(one["one_thread"]["cpu_us_per_observation"])
 
 
 def _memory(results: Results, path: Path) -> None:

@@ -128,15 +128,19 @@ def _solver(results: Results) -> str:
             for s in SOLVER_STAGES
         ]
         speed.append([f"{one['frames']}", f"{whole:.2f}", *ratios])
+    over = f"over {sizes[0]['smallest']}"
     header = ["frames", "points", "observations", "iterations", "set-up"]
-    header += ["iteration", "us/observation", f"over {sizes[0]['smallest']}", "all, s"]
+    header += ["iteration", "us/observation", over, "all, s"]
     said = sorted({line for one in sizes for line in one["log"]})
     return "\n\n".join(
         [
             "## Solver",
             "CPU milliseconds on one core: of the set-up (observations sorted, "
             "structure found), and of one iteration, whole and by stage; seconds of "
-            "all; peak memory of the process in MB (and before the solve).",
+            "all; peak memory of the process in MB (and before the solve). "
+            f'"{over}" is the cost per observation and iteration over that of the '
+            "smallest survey, whose solves took turns with this one's iterations: the "
+            "lines were measured one after another, at speeds that may differ.",
             table([*header, *SOLVER_STAGES, "MB"], lines),
             *(["The solver's own words: " + "; ".join(said) + "."] if said else []),
             "![time per observation](solver.png) ![memory](memory.png)",

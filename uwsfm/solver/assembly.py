@@ -153,7 +153,7 @@ def _add_couplings(fours, j, count, x, y, z, frame, f, at, slots, of_point):
         _add_four(of_point, row2, k, _turned(r13, a, r23, b, r33, c))
 
 
-@inner_straight
+@lane
 def rotation(frames, f):
     """Nine numbers of the rotation in a row of [R | t]."""
     return (
@@ -223,7 +223,7 @@ def plus(s, t):
     )
 
 
-@inner_straight
+@lane
 def write_point(p, total, v, grad):
     """V (3, 3) and gradient (3,) of a point from its nine scalars."""
     v00, v10, v11, v20, v21, v22, g0, g1, g2 = total
@@ -295,7 +295,7 @@ def add_cell(x, y, z, frame, c, f, sums_of_cell, turns, moves, cells):
     return point_sums(frame, a, b, d, g0, g1, g2)
 
 
-@inner_straight
+@lane
 def sum_rows(rows, first, last):
     """J^T W J by the point in the rig (lower triangle), J^T W r: 9 scalars."""
     h00, h10, h11, h20, h21, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
