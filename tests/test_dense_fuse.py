@@ -189,7 +189,7 @@ def test_sizes_are_read():
     ("option", "value", "words"),
     [
         ("min_views", 0, "--min-views must be at least 1"),
-        ("voxel", np.inf, "--voxel must be positive"),
+        ("voxel", np.inf, "--voxel must be positive and finite"),
         ("noise_px", -0.1, "--noise-px must be positive"),
         ("max_memory", 0.0, "--max-memory must be positive"),
         ("num_threads", 0, r"--threads \(num_threads\) must be positive"),

@@ -173,7 +173,9 @@ def test_priors_of_what_is_held_do_nothing(noisy_start):
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_priors_are_refused(name, value):
-    with pytest.raises(InputError, match=f"{name} must be positive, got") as refused:
+    with pytest.raises(
+        InputError, match=f"{name} must be positive and finite, got"
+    ) as refused:
         predict_covariance(small_scene().scene, 0.3, **{name: value})
     assert "\n" not in str(refused.value)
 

@@ -100,7 +100,7 @@ def _single(
         raise InputError(f"--from and --to: both ends are the same {picks[0]}")
     for option, value in (("--known", known), ("--click-stddev", click_stddev)):
         if value is not None and not 0.0 < value < math.inf:
-            raise InputError(f"{option} must be positive, got {value:g}")
+            raise InputError(f"{option} must be positive and finite, got {value:g}")
     item: dict[str, Any] = {"name": "distance", "ends": picks}
     content: dict[str, Any] = {"version": 1}
     if click_stddev is not None:

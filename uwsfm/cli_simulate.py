@@ -1,7 +1,8 @@
 """uwsfm simulate: synthetic dives with known truth."""
 
+import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -10,6 +11,24 @@ from uwsfm.cli_options import SeedOption
 
 MAX_RANGE_M = 10
 """Beyond it the water hides the floor."""
+
+
+def _number(low: float, high: float, what: str) -> Any:
+    """An option in a range. Of typer's own, nan would be told that it is too large."""
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise typer.BadParameter(
+                f"must be a number from {low:g} to {high:g}, got {text}"
+            )
+        return value
+
+    return typer.Option(parser=parsed, metavar=f"{low:g} to {high:g}", help=what)
+
 
 simulate_app = typer.Typer(
     help="Synthetic dives with known truth.", no_args_is_help=True
@@ -63,30 +82,19 @@ def simulate_observations(
     ] = "rich",
     frames: Annotated[int, typer.Option(min=2, max=100_000, help="Stereo pairs.")] = 15,
     altitude_m: Annotated[
-        float,
-        typer.Option(min=0.01, max=MAX_RANGE_M, help="Mean height above ground."),
+        float, _number(0.01, MAX_RANGE_M, "Mean height above ground.")
     ] = 2.0,
     relief_m: Annotated[
-        float, typer.Option(min=0, max=MAX_RANGE_M, help="Its standard deviation.")
+        float, _number(0, MAX_RANGE_M, "Its standard deviation.")
     ] = 0.2,
     points: Annotated[
         int, typer.Option(min=1, max=10_000_000, help="Seen at least twice.")
     ] = 800,
-    noise_px: Annotated[
-        float, typer.Option(min=0, max=100, help="Per image coordinate.")
-    ] = 0.5,
-    outliers: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of the observations.")
-    ] = 0.0,
-    distance_m: Annotated[
-        float, typer.Option(min=0, max=0.5, help="Of both ports.")
-    ] = 0.02,
-    thickness_m: Annotated[
-        float, typer.Option(min=0, max=0.5, help="Of both glasses.")
-    ] = 0.005,
-    focal_px: Annotated[
-        float, typer.Option(min=100, max=100_000, help="Of both cameras.")
-    ] = 1000.0,
+    noise_px: Annotated[float, _number(0, 100, "Per image coordinate.")] = 0.5,
+    outliers: Annotated[float, _number(0, 1, "Share of the observations.")] = 0.0,
+    distance_m: Annotated[float, _number(0, 0.5, "Of both ports.")] = 0.02,
+    thickness_m: Annotated[float, _number(0, 0.5, "Of both glasses.")] = 0.005,
+    focal_px: Annotated[float, _number(100, 100_000, "Of both cameras.")] = 1000.0,
     seed: SeedOption = 0,
 ) -> None:
     """Simulate what a stereo rig observes, with ground truth, as arrays.

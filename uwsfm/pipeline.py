@@ -264,7 +264,8 @@ def scene_distance(rig: Rig, given_m: float | None) -> float:
         )
     if not 0.0 < given_m < np.inf:
         raise InputError(
-            f"--scene-distance (scene_distance_m) must be positive, got {given_m}"
+            "--scene-distance (scene_distance_m) must be positive and finite, "
+            f"got {given_m}"
         )
     return given_m
 

@@ -49,7 +49,9 @@ class Distances:
             wrong = ~(np.isfinite(values) & (values > 0.0))
             if np.any(wrong):
                 row = int(np.argmax(wrong))
-                raise InputError(f"{name}[{row}] must be positive, got {values[row]}")
+                raise InputError(
+                    f"{name}[{row}] must be positive and finite, got {values[row]}"
+                )
         same = pairs[:, 0] == pairs[:, 1]
         if np.any(same):
             raise InputError(f"ends[{int(np.argmax(same))}] are one and the same")

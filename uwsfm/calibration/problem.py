@@ -107,7 +107,7 @@ class CalibrateOptions:
         for name in PRIORS:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < np.inf:
-                raise InputError(f"{name} must be positive, got {value}")
+                raise InputError(f"{name} must be positive and finite, got {value}")
         if self.max_iterations < 1:
             raise InputError(f"max_iterations must be >= 1, got {self.max_iterations}")
         if not 0.0 <= self.baseline_stddev_m < np.inf:

@@ -162,7 +162,7 @@ def predict_covariance(
     """
     settings = CalibrateOptions.parsed(options)
     if not 0.0 < noise_px < np.inf:
-        raise InputError(f"noise_px must be positive, got {noise_px}")
+        raise InputError(f"noise_px must be positive and finite, got {noise_px}")
     pixels, valid = scene.projections()
     if not np.all(valid):
         row = int(np.nonzero(~valid)[0][0])

@@ -46,7 +46,7 @@ class DenseOptions:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 option = f"--{name.replace('_', '-')}"
-                raise InputError(f"{option} must be positive, got {value}")
+                raise InputError(f"{option} must be positive and finite, got {value}")
         require_threads(self.num_threads)
 
 

@@ -91,7 +91,7 @@ class MatchOptions:
         error_px = self.fundamental_max_error_px
         if error_px is not None and not 0.0 < error_px < math.inf:
             raise InputError(
-                f"fundamental_max_error_px must be positive, got {error_px}"
+                f"fundamental_max_error_px must be positive and finite, got {error_px}"
             )
 
 
@@ -157,7 +157,8 @@ class StartOptions:
             )
         if not 0.0 < self.scene_distance_m < math.inf:
             raise InputError(
-                f"scene_distance_m must be positive, got {self.scene_distance_m}"
+                "scene_distance_m must be positive and finite, got "
+                f"{self.scene_distance_m}"
             )
         require_threads(self.num_threads)
         if not 0 <= self.seed <= MAX_SEED:

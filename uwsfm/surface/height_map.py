@@ -87,7 +87,7 @@ def make_height_map(
     """
     for name, value in (("resolution", resolution), ("max-gap", max_gap)):
         if value is not None and not 0.0 < value < np.inf:
-            raise InputError(f"--{name} must be positive, got {value}")
+            raise InputError(f"--{name} must be positive and finite, got {value}")
     good = np.isfinite(points).all(axis=1)
     points, colors = points[good], colors[good]
     spacing = point_spacing(points[:, :2])
