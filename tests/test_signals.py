@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from uwsfm._signals import STOPPING
+
 STOPPED = """
 import os, signal, sys, time
 import typer
@@ -25,6 +27,7 @@ def wait():
             raise SystemError("returned a result with an exception set") from stopped
 
 name, form = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
 sys.argv[1:] = ["wait"]
 cli.main()
 """
@@ -44,6 +47,37 @@ def test_signals_end_in_the_sentence_of_an_interrupted_run(name, code, form):
     )
     assert found.returncode == code
     assert found.stderr == "interrupted; the same command resumes the run\n"
+
+
+SLOW = """
+import os, signal, sys, time
+from concurrent.futures import ThreadPoolExecutor
+from uwsfm import cli
+
+@cli.app.command()
+def wait():
+    from uwsfm.console import ProgressBars
+    with ProgressBars(), ThreadPoolExecutor(1) as pool:
+        pool.submit(time.sleep, 2)
+        os.kill(os.getpid(), getattr(signal, name))
+        time.sleep(60)
+
+(name,) = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
+sys.argv[1:] = ["wait"]
+cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no SIGTERM")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_slow_end_is_announced(name, code):
+    """Threads of pycolmap end between two images: whoever waits should know."""
+    found = subprocess.run(
+        [sys.executable, "-c", SLOW, name], capture_output=True, text=True, check=False
+    )
+    sentences = [STOPPING, "interrupted; the same command resumes the run"]
+    assert (found.returncode, found.stderr.splitlines()) == (code, sentences)
 
 
 STOPPED_WRITING = """

@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 import uwsfm
+from uwsfm._signals import STOPPING
 from uwsfm.demo import sample_dir
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.rig_file import load_rig
@@ -142,10 +143,9 @@ def test_a_signal_to_the_whole_group_ends_all_processes_without_a_word():
     assert len(children) >= 3  # a scheduler and two workers, with who watches them
     os.killpg(process.pid, signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (
-        143,
-        "interrupted; the same command resumes the run\n",
-    )
+    assert process.returncode == 143
+    told = errors.removeprefix(f"{STOPPING}\n")  # on a busy machine
+    assert told == "interrupted; the same command resumes the run\n"
     deadline = time.monotonic() + 10.0  # they were killed; somebody has to notice
     while any(psutil.pid_exists(child) for child in children):
         assert time.monotonic() < deadline

@@ -22,7 +22,7 @@ from rich.text import Text
 from uwsfm._signals import (
     RESUMES,
     interruption_in,
-    raise_on_sigterm,
+    raise_on_signals,
     tell_interrupted,
 )
 
@@ -37,7 +37,7 @@ errors = Console(stderr=True)
 class ProgressBars:
     """Draws `uwsfm._progress.Progress` reports, one bar per step.
 
-    SIGTERM is an exception from its start on: what takes long to import comes after.
+    A signal is an exception from its start on: what takes long to import comes after.
 
     Args:
         left: what is told if the command is interrupted.
@@ -56,7 +56,7 @@ class ProgressBars:
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> ProgressBars:
-        raise_on_sigterm()
+        raise_on_signals()
         return self
 
     def __exit__(self, _: object, failure: BaseException | None, *__: object) -> None:
