@@ -87,13 +87,24 @@ def test_what_is_wrong_with_a_file_is_said_with_its_key(tmp_path, dives, message
 
 
 def test_wrong_input_needs_no_workers_and_is_one_sentence_in_the_log(
-    tmp_path, monkeypatch
+    tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setattr(Workers, "outcomes", None)  # not to be called
     (outcome,) = run_batch(written(tmp_path, {"version": 1, "dives": [DIVE]}))
+    assert caplog.messages == [f"dive bow: {outcome.reason}"]  # and once on the screen
     assert "rig.yaml" in outcome.reason
     log = (tmp_path / "bow" / LOG).read_text().splitlines()
     assert log[-1].endswith(f"failed: {outcome.reason}") and len(log) == 2
+
+
+def test_a_dive_named_as_its_images_leaves_nothing_among_them(tmp_path):
+    small_dive(tmp_path, num_frames=1)
+    dive = {"name": "images", "rig": "rig.yaml", "images": "./images"}
+    before = sorted(tmp_path.rglob("*"))
+    path = written(tmp_path, {"version": 1, "dives": [dive]})
+    (outcome,) = run_batch(path)
+    assert "images is the folder of the images" in outcome.reason
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, path])
 
 
 def test_no_threads_at_all_are_refused(tmp_path):
@@ -146,7 +157,7 @@ def test_a_failed_dive_does_not_stop_the_others(tmp_path):
     table = " ".join(found.stdout.split())
     for dive in dives:
         assert dive["name"] in table
-    assert table.count("6 of 6") == 2
+    assert "result" in table and table.count("6 of 6") == 2
     assert "does not exist" in " ".join(table.replace("│", " ").split())
     for name in ("good", "again"):
         assert (tmp_path / name / "summary.json").exists()

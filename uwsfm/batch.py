@@ -94,10 +94,11 @@ def run_batch(
 
 
 def _refused(dives: Sequence[Dive]) -> dict[int, Outcome]:
-    """Dives whose rig or images cannot be used, told before any process starts."""
+    """Dives whose rig or folders cannot be used, told before any process starts."""
     wrong = {}
     for index, dive in enumerate(dives):
         try:
+            output_folder(dive.out, dive.images)
             find_frames(dive.images, checked_rig(dive.rig))
         except InputError as error:
             logger.warning("dive %s: %s", dive.name, error)
@@ -109,7 +110,7 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
     """Reconstruct a dive; whatever goes wrong is its outcome, and in its log."""
     began = time.monotonic()
     try:
-        out = output_folder(dive.out)
+        out = output_folder(dive.out, dive.images)
         out.mkdir(parents=True, exist_ok=True)
         with _logged(out / LOG) as log:
             log.info("dive %s, images %s", dive.name, dive.images)
@@ -165,16 +166,18 @@ class _StepLog:
 
 @contextmanager
 def _logged(path: Path) -> Iterator[logging.Logger]:
-    """What uwsfm logs in this process goes to the end of a file."""
+    """What uwsfm logs in this process goes to the end of a file, and nowhere else."""
     log = logging.getLogger("uwsfm")
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    level = log.level
+    level, propagate = log.level, log.propagate
     log.addHandler(handler)
     log.setLevel(logging.INFO)
+    log.propagate = False
     try:
         yield log.getChild(f"batch.{os.getpid()}")
     finally:
         log.removeHandler(handler)
         log.setLevel(level)
+        log.propagate = propagate
         handler.close()

@@ -287,7 +287,7 @@ def batch_table(outcomes: Iterable[Outcome]) -> Table:
     """What became of each dive."""
     table = Table(title="Dives", title_justify="left")
     table.add_column("dive", no_wrap=True)
-    table.add_column("")
+    table.add_column("result")
     for column in ("frames", "RMS (px)", "minutes"):
         table.add_column(column, justify="right", no_wrap=True)
     for outcome in outcomes:

@@ -1,5 +1,6 @@
 """The output folder of a run: never over what others made, one run at a time."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,9 +18,17 @@ RESULTS = (SPARSE, HOUSING, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
 """What a run writes."""
 
 
-def output_folder(out: str | Path) -> Path:
-    """Refuse what would overwrite files that are not ours."""
+def output_folder(out: str | Path, images: str | Path | None = None) -> Path:
+    """Refuse what would overwrite files that are not ours, or mix with the images.
+
+    Raises:
+        InputError: a file, the folder of the images, or one with results of others.
+    """
     out = Path(out)
+    if images is not None and os.path.realpath(out) == os.path.realpath(images):
+        raise InputError(
+            f"{out} is the folder of the images: choose another for results"
+        )
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, not a folder for results")
     if _made_by_us(out):

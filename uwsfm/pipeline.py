@@ -133,7 +133,7 @@ def reconstruct(
     command = command_line("reconstruct", reconstruct, locals())
     rig = checked_rig(rig)
     require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
-    out = output_folder(out)
+    out = output_folder(out, images)
     options = StartOptions(
         features=FeatureOptions(
             clahe=clahe, mask_dir=None if masks is None else Path(masks)

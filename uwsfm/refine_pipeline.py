@@ -138,7 +138,7 @@ def refine_model(
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
     distance_m = scene_distance(rig, scene_distance_m)
-    source, out = Path(source), output_folder(out)
+    source, out = Path(source), output_folder(out, images)
     found = _found(source)
     if out.exists() and _same_or_inside(found.folder, out / SPARSE):
         raise InputError(
