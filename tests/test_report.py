@@ -55,6 +55,9 @@ def test_refine_writes_a_page_that_says_what_the_summary_says(dive_result):
         "report/report.json",
         "summary.json",
     }
+    factor = payload_of(page)["scales"]["factor"]  # to compare cameras by eye
+    cameras = len(payload_of(page)["residuals"])
+    assert page.count(f"{factor} times as long in\nall maps") == cameras == 2
     cloud = base64.b64decode(payload_of(page)["view"]["points"])
     points = np.frombuffer(cloud, "<f4").reshape(-1, 3)
     np.testing.assert_allclose(

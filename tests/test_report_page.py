@@ -11,6 +11,25 @@ pytestmark = pytest.mark.slow  # seconds per page: WebGL without a graphics card
 NO_CARD = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
+CORNERS = """
+(() => {
+  const plot = document.querySelector("#cloud"), scene = plot._fullLayout.scene._scene;
+  const { model, view, projection } = scene.glplot.cameraParams;
+  const times = (m, v) => [0, 1, 2, 3].map(
+    (row) => v.reduce((sum, value, k) => sum + m[4 * k + row] * value, 0));
+  const ranges = JSON.parse(document.getElementById("data").textContent).view.ranges;
+  return [...Array(8).keys()].map((n) => {
+    const corner = ranges.map((range, k) => scene.dataScale[k] * range[n >> k & 1]);
+    const seen = times(projection, times(view, times(model, [...corner, 1])));
+    return Math.min(
+      plot.clientWidth / 2 * (1 - Math.abs(seen[0]) / seen[3]),
+      plot.clientHeight / 2 * (1 - Math.abs(seen[1]) / seen[3]));
+  });
+})()
+"""
+"""Pixels between the corners of the 3-D axes and the border."""
+
+
 @pytest.fixture(scope="module")
 def chromium():
     api = pytest.importorskip("playwright.sync_api")
@@ -71,6 +90,7 @@ def test_it_draws_offline_on_every_screen(opened, request):
         "p => p.querySelector('svg.main-svg') !== null)"
     )
     assert opened.js("document.querySelector('#cloud canvas') !== null")
+    assert 45.0 < min(opened.js(CORNERS)) < 55.0  # room for labels, and no more
     ink = opened.js("document.querySelector('#cost')._fullLayout.font.color")
     paper = opened.js("getComputedStyle(document.body).backgroundColor")
     bright = sum(int(value) for value in paper[4:-1].split(",")) > 3 * 128

@@ -31,7 +31,7 @@ _SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """Of the plots of one camera, the same before and after."""
+    """Of the plots of residuals, the same for all cameras, before and after."""
 
     map_px: float
     """Darkest colour of the maps."""
@@ -54,7 +54,7 @@ def page_of(report: Report) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     environment.globals["badge"] = lambda word, what="": Markup(_badge(word, what))
     template = environment.from_string(asset("report.html.j2"))
-    scales = [scales_of(camera) for camera in report.residuals]
+    scales = scales_of(report.residuals)
     summary = report.summary
     earlier = summary.get("steps_of_earlier_runs", ())
     return template.render(
@@ -93,13 +93,18 @@ def _badge(word: str, what: str) -> str:
     return f'<span class="badge {kind}">{sign}{text}</span>'
 
 
-def scales_of(camera: CameraResiduals) -> Scales:
-    """Wide enough for the larger of the two models."""
-    models = [m for m in (camera.pinhole, camera.refractive) if m is not None]
+def scales_of(cameras: Sequence[CameraResiduals]) -> Scales:
+    """Wide enough for both models in all cameras, which are compared by eye."""
+    models = [
+        model
+        for c in cameras
+        for model in (c.pinhole, c.refractive)
+        if model is not None
+    ]
     lengths = [np.linalg.norm(model.cells_px, axis=2) for model in models]
     known = np.concatenate([length[np.isfinite(length)] for length in lengths])
     largest = float(np.percentile(known, 95.0)) if len(known) else 0.1
-    cell = max(camera.size) / max(camera.counts.shape)
+    cell = min(max(camera.size) / max(camera.counts.shape) for camera in cameras)
     profile = max(map(_largest, models))
     return Scales(
         map_px=max(largest, 1e-3),
@@ -192,11 +197,17 @@ def _freed_words(camera: CameraResiduals) -> str:
 
 
 def _systematic_words(report: Report) -> str:
-    parts = [
-        f"{_systematic(camera.refractive.systematic_px)} ({camera.name})"
-        for camera in report.residuals
-    ]
-    return f"Of it, {', '.join(parts)} is systematic by place in the image and depth."
+    """Cameras of which the same is said are told together."""
+    cameras: dict[str, list[str]] = {}
+    for camera in report.residuals:
+        value = camera.refractive.systematic_px
+        part = _systematic(value) if math.isfinite(value) else "unknown"
+        cameras.setdefault(part, []).append(camera.name)
+    parts = [f"{part} in {' and '.join(names)}" for part, names in cameras.items()]
+    return (
+        "Its systematic part, which repeats at the same place in the image and the "
+        f"same depth, is {', '.join(parts)}."
+    )
 
 
 def _systematic(value: float) -> str:
@@ -231,7 +242,7 @@ def _frame_rows(report: Report) -> list[_Row]:
     return rows
 
 
-def _payload(report: Report, scales: list[Scales]) -> dict[str, Any]:
+def _payload(report: Report, scales: Scales) -> dict[str, Any]:
     """What the script of the page draws from."""
     return {
         "unit": report.unit,
@@ -251,8 +262,6 @@ def _view_payload(report: Report) -> dict[str, Any]:
     room = 0.03 * max(float((high - low).max()), 1e-6)
     low, high = low - room, high + room
     span = high - low
-    looked_at = np.median(view.points, axis=0) if len(view.points) else low
-    middle = 0.5 * (looked_at + np.median(view.trajectory, axis=0))
     return {
         "points": _packed(view.points),
         "colors": base64.b64encode(view.colors.tobytes()).decode("ascii"),
@@ -266,7 +275,6 @@ def _view_payload(report: Report) -> dict[str, Any]:
         "up": view.up.tolist(),
         "ranges": np.stack([low, high], axis=1).tolist(),
         "aspect": (span / span.max()).tolist(),
-        "middle": ((middle - 0.5 * (low + high)) / span.max()).tolist(),
     }
 
 

@@ -44,8 +44,10 @@ def _without_collection() -> Iterator[None]:
 
 
 def _draw_all(report: Report, folder: Path) -> None:
+    scales = scales_of(report.residuals)
     for index, camera in enumerate(report.residuals):
-        _save(_residual_figure(camera, report.unit), folder / f"residuals_{index}.png")
+        figure = _residual_figure(camera, report.unit, scales)
+        _save(figure, folder / f"residuals_{index}.png")
     _save(_coverage_figure(report), folder / "coverage.png")
     _save(_convergence_figure(report.summary), folder / "convergence.png")
     _save(_cloud_figure(report), folder / "cloud.png")
@@ -81,10 +83,9 @@ def _save(figure: "Figure", path: Path) -> None:
     figure.savefig(path, dpi=_DPI)
 
 
-def _residual_figure(camera: CameraResiduals, unit: str) -> "Figure":
+def _residual_figure(camera: CameraResiduals, unit: str, scales: Scales) -> "Figure":
     models = [("best pinhole", camera.pinhole), ("uwsfm", camera.refractive)]
     drawn = [(title, model) for title, model in models if model is not None]
-    scales = scales_of(camera)
     figure, grid = _panels(4.8, 3.1, 3, len(drawn))
     for column, (title, model) in enumerate(drawn):
         _map(grid[0, column], camera, model, scales)

@@ -40,8 +40,8 @@ def verdict_of(summary: dict[str, Any]) -> Verdict:
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
         fit=f"{registered} of {frames} frames are registered, with {points} points "
-        f"seen in {count} observations. The true reprojection error is "
-        f"{rms['after']:.3g} px RMS, before the adjustment {rms['before']:.3g} px.",
+        f"seen in {count} observations. The adjustment brought the true reprojection "
+        f"error from {rms['before']:.3g} to {rms['after']:.3g} px RMS.",
         ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
         open=tuple(_sentence(text) for text in summary["warnings"]),
     )

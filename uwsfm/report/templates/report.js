@@ -119,7 +119,7 @@
     }));
   }
   data.residuals.forEach((camera, index) => {
-    const limits = data.scales[index];
+    const limits = data.scales;
     for (const kind of ["pinhole", "refractive"]) {
       if (camera[kind] === null) continue;
       residualMap(`map-${kind}-${index}`, camera, kind, limits);
@@ -180,15 +180,28 @@
   function xyz(list) {
     return { x: list[0], y: list[1], z: list[2] };
   }
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const cross = (a, b) => [0, 1, 2].map((k) => {
+    const i = (k + 1) % 3, j = (k + 2) % 3;
+    return a[i] * b[j] - a[j] * b[i];
+  });
+  const unit = (v) => v.map((value) => value / Math.hypot(...v));
+  // From where all corners of the axes are in the frame, with room for their labels.
+  function distance(away) {
+    const right = unit(cross(view.up, away)), up = cross(away, right);
+    const width = element.clientWidth, height = element.clientHeight, room = 50;
+    const slope = 2 * Math.tan(Math.PI / 8) / height; // per pixel: Plotly sees 45 degrees
+    const wide = slope * (width / 2 - room), high = slope * (height / 2 - room);
+    const corners = [...Array(8).keys()].map(
+      (n) => view.aspect.map((side, k) => ((n >> k & 1) - 0.5) * side));
+    return Math.max(...corners.map((corner) => dot(corner, away)
+      + Math.max(Math.abs(dot(corner, right)) / wide, Math.abs(dot(corner, up)) / high)));
+  }
   function firstCamera() {
-    const side = [0, 1, 2].map((k) => {
-      const a = (k + 1) % 3, b = (k + 2) % 3;
-      return view.sight[a] * view.up[b] - view.sight[b] * view.up[a];
-    });
-    const away = [0, 1, 2].map((k) => -view.sight[k] + 0.8 * view.up[k] + 0.5 * side[k]);
-    const length = Math.hypot(...away), far = element.clientWidth < 600 ? 1.7 : 1.4;
-    const eye = away.map((v, k) => view.middle[k] + v * far / length);
-    return { eye: xyz(eye), up: xyz(view.up), center: xyz(view.middle) };
+    const side = cross(view.sight, view.up);
+    const away = unit([0, 1, 2].map((k) => -view.sight[k] + 0.8 * view.up[k] + 0.5 * side[k]));
+    const far = distance(away), eye = away.map((v) => far * v);
+    return { eye: xyz(eye), up: xyz(view.up), center: xyz([0, 0, 0]) };
   }
   function marker(color) {
     const base = { size: state.size, opacity: 1, line: { width: 0 } };
