@@ -51,7 +51,7 @@ MAX_ITERATIONS = 50
 SMALL_SOLVES = 5
 """At a time, a fifth of a second or more, while a larger survey waits."""
 TURNS = 3
-"""Of the larger survey."""
+"""Of one thread and two, and of a survey with the smallest."""
 
 
 class Solve:
@@ -89,12 +89,16 @@ def measure(num_frames: int, smallest: int, folder: str) -> dict[str, Any]:
     before = peak_memory_mb()
     messages, compiled = _listen(), _count_compilations()
     solve = Solve(start)
-    one, result = _timed(solve, num_threads=1)
+    first, result = _timed(solve, num_threads=1)
     peak = peak_memory_mb()
     growth = _over_smallest(
         solve, Solve(surveys.start_of(surveys.load(smallest, folder)))
     )
-    two, _ = _timed(solve, num_threads=2)
+    singles, doubles = [first], [_timed(solve, num_threads=2)[0]]
+    for _ in range(TURNS - 1):
+        singles.append(_timed(solve, num_threads=1)[0])
+        doubles.append(_timed(solve, num_threads=2)[0])
+    one, two = _mean(singles), _mean(doubles)
     if two["iterations"] != one["iterations"]:
         raise RuntimeError("two threads took another way than one")
     distances = result.state.ports[:, 3]
@@ -119,6 +123,17 @@ def measure(num_frames: int, smallest: int, folder: str) -> dict[str, Any]:
         "log": sorted(set(messages)),
         "compiled": len(compiled),
     }
+
+
+def _mean(runs: list[Any]) -> Any:
+    """Of the times of solves that took the same way."""
+    if isinstance(runs[0], dict):
+        return {key: _mean([run[key] for run in runs]) for key in runs[0]}
+    if isinstance(runs[0], int):
+        if len(set(runs)) > 1:
+            raise RuntimeError("the same solve took two ways")
+        return runs[0]
+    return float(np.mean(runs))
 
 
 def _over_smallest(large: Solve, small: Solve) -> float:

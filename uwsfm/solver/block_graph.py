@@ -119,8 +119,8 @@ def _count_blocks(entries, num_blocks, work):
     seen = np.full(len(num_blocks), -1)
     for i in range(len(num_blocks)):
         num_blocks[i], met = _mark_row(entries, i, seen)
-        # Folding a cell costs about as much as four products, beside its own.
-        work[i] = met + 5 * (entries[2][i + 1] - entries[2][i]) + 1
+        # Folding a cell costs about as much as a product, beside its own.
+        work[i] = met + 2 * (entries[2][i + 1] - entries[2][i]) + 1
 
 
 @kernel
