@@ -126,7 +126,7 @@ def small_dive(folder: Path, num_frames: int, scale: float = 0.4) -> None:
 def test_a_failed_dive_does_not_stop_the_others(tmp_path):
     """The second of three dives has no images, the third cannot be matched."""
     small_dive(tmp_path, num_frames=6)
-    blank = tmp_path / "blank"
+    blank = tmp_path / "grey"
     for folder in ("left", "right"):
         (blank / folder).mkdir(parents=True)
         for source in (tmp_path / "images" / folder).iterdir():
@@ -135,7 +135,7 @@ def test_a_failed_dive_does_not_stop_the_others(tmp_path):
     dives = [
         {"name": "good", "rig": "rig.yaml", "images": "images"},
         {"name": "lost", "rig": "rig.yaml", "images": "nowhere"},
-        {"name": "blank", "rig": "rig.yaml", "images": "blank"},
+        {"name": "blank", "rig": "rig.yaml", "images": "grey"},
         {"name": "again", "rig": "rig.yaml", "images": "images"},
     ]
     path = written(tmp_path, {"version": 1, "dives": dives})
