@@ -188,9 +188,9 @@ def _linearize_points(layout, state, loss, scale, begin, end, chunk, sums, out):
 def scatter(layout: Layout, parts: list[Sums], out: NormalEquations) -> None:
     """Sum parts up in their order; cameras may share border columns."""
     cameras = layout.num_camera_cols
+    chosen = parts[0].column.reshape(-1, 1) == np.arange(cameras)  # the same in all
     for sums in parts:
         add_frames(sums.seen, sums.turns, sums.moves, out.frames, out.frames_grad)
-        chosen = sums.column.reshape(-1, 1) == np.arange(cameras)
         slots = sums.slots.reshape(len(sums.seen), 6, -1)
         out.frames_border[sums.seen, :, :cameras] += slots @ chosen
     blocks = np.sum([sums.blocks for sums in parts], axis=0)
