@@ -17,12 +17,10 @@ from scipy.sparse import csr_matrix
 from solver import Solve, cpu_per_observation
 from threadpoolctl import threadpool_limits
 
-from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.colmap import to_reconstruction
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.solver.layout import HELD, Layout, build_layout
-from uwsfm.solver.state import State
+from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.threads import limited
 
 ITERATIONS = 10
@@ -116,10 +114,8 @@ def least_squares_scipy(num_frames: int, folder: str, steps: int) -> dict[str, A
     the same: what differs is the solver.
     """
     start = surveys.start_of(surveys.load(num_frames, folder))
-    columns = CalibrateOptions(loss="l2").border_columns(
-        start.cameras, np.zeros(len(start.cameras), dtype=bool)
-    )
-    layout, state = build_layout(start, columns), State.from_scene(start)
+    solve = Solve(start)
+    layout, state = solve.layout, solve.state
     offset = layout.num_frame_cols + layout.num_border_cols
 
     def residuals(x: Array) -> Array:

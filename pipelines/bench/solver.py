@@ -63,14 +63,14 @@ class Solve:
         )
         clock = time.process_time()
         self.layout = build_layout(start, columns)
-        self._state = State.from_scene(start)
+        self.state = State.from_scene(start)
         self.sorting_s = time.process_time() - clock
 
     def __call__(
         self, max_iterations: int = MAX_ITERATIONS, report: Report | None = None
     ) -> LevenbergMarquardtResult:
         options = LevenbergMarquardtOptions(max_iterations=max_iterations)
-        return minimize(self.layout, self._state, options, report=report)
+        return minimize(self.layout, self.state, options, report=report)
 
 
 def measure(num_frames: int, smallest: int, folder: str) -> dict[str, Any]:
