@@ -30,6 +30,7 @@ from uwsfm.export.summary import (
     scale_summary,
     versions,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import NoPort
@@ -56,6 +57,8 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
+from uwsfm.trust.goodness import Used
+from uwsfm.trust.verdict import Verdict, judged
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,6 +72,8 @@ class ReconstructResult:
     """summary.json"""
     start: StartArrays
     """Where the mapper ended, before the refractive adjustment."""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def reconstruct(
@@ -195,12 +200,15 @@ class _Job:
         clock = time.perf_counter()
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
-        export_housing(model.rig, out / HOUSING, refined.calibration)
+        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
+        word = verdict.verdict
+        export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
         summary["command"] = self.command
+        summary = with_verdict(verdict, summary)
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(
@@ -208,6 +216,7 @@ class _Job:
             calibration=refined.calibration,
             summary=summary,
             start=arrays,
+            verdict=verdict,
         )
 
     def _refined(self, start: Start, arrays: StartArrays) -> Refined:
@@ -223,6 +232,23 @@ class _Job:
             lengths=lengths,
             **self.calibration,
         )
+
+
+def refined_verdict(rig: Rig, refined: Refined, num_frames: int) -> Verdict:
+    """The verdict on a refined scene.
+
+    Args:
+        rig: As given.
+        refined: The result.
+        num_frames: That there were, registered or not.
+    """
+    used = Used(
+        num_frames=num_frames,
+        num_registered=len(np.unique(refined.scene.frame_idx)),
+        num_tested=refined.num_tested,
+        num_kept=len(refined.kept),
+    )
+    return judged(rig, refined.calibration, used)
 
 
 def compiled(num_threads: int, progress: Progress) -> dict[str, float]:

@@ -27,6 +27,7 @@ from uwsfm.export.summary import (
     refined_summary,
     versions,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import (
@@ -37,6 +38,7 @@ from uwsfm.pipeline import (
     locked,
     output_folder,
     refined_rig,
+    refined_verdict,
     require_effect,
     scene_distance,
 )
@@ -61,6 +63,7 @@ from uwsfm.sfm.refine import (
     rig_options,
     without_empty_frames,
 )
+from uwsfm.trust.verdict import Verdict
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 """Camera models without distortion: light through a flat port never fits them."""
@@ -86,6 +89,8 @@ class RefineResult:
     model_idx: NDArray[np.int64]
     """(N,) index in ``start.model`` of each observation of ``model.scene``; -1 of those
     that only the database has."""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def refine_model(
@@ -238,13 +243,15 @@ class _Job:
         model_idx = tracks.model_idx[refined.kept]
         model, refined = self._model(refined, tracks)
         export_colmap(model, self.out / SPARSE)
-        export_housing(model.rig, self.out / HOUSING, refined.calibration)
+        verdict = refined_verdict(self.rig, refined, len(tracks.frame_names))
+        word, calibration = verdict.verdict, refined.calibration
+        export_housing(model.rig, self.out / HOUSING, calibration, verdict=word)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
         summary["command"] = self.command
-        calibration = refined.calibration
+        summary = with_verdict(verdict, summary)
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report
         )
@@ -254,6 +261,7 @@ class _Job:
             summary=summary,
             start=self.start,
             model_idx=model_idx,
+            verdict=verdict,
         )
 
     def _refined(

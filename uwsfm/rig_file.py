@@ -59,8 +59,13 @@ _Loader.add_implicit_resolver(
 )
 
 
-def load_rig(path: str | Path) -> Rig:
+def load_rig(path: str | Path, *, of_result: bool = False) -> Rig:
     """Read and check a rig.yaml.
+
+    Args:
+        path: The file.
+        of_result: It was estimated, and its lengths may be what no housing has: what
+            is wrong with them is for the verdict on the result to say.
 
     Raises:
         InputError: one sentence with the file, the key path and what is wrong.
@@ -68,7 +73,7 @@ def load_rig(path: str | Path) -> Rig:
     token = None
     try:
         data = read_yaml(Path(path))
-        token = ARBITRARY_SCALE.set(data.get("scale") == "arbitrary")
+        token = ARBITRARY_SCALE.set(of_result or data.get("scale") == "arbitrary")
         return _to_rig(RigFile.model_validate(data))
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None

@@ -5,9 +5,11 @@ from pathlib import Path
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.observability import center_verdict, distance_verdict
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.export.verdict_summary import shown_word
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
+from uwsfm.trust.verdict import FITS
 
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
 Standard deviations are one sigma; normals are unit vectors from camera to water."""
@@ -16,22 +18,37 @@ refined is in the arbitrary unit of the model, not in metres."""
 
 
 def export_housing(
-    rig: Rig, path: str | Path, calibration: CalibrationResult | None = None
+    rig: Rig,
+    path: str | Path,
+    calibration: CalibrationResult | None = None,
+    *,
+    verdict: str = FITS,
 ) -> None:
-    """Write a rig, with standard deviations as comments if known."""
+    """Write a rig, with standard deviations as comments if known.
+
+    Args:
+        rig: As refined.
+        path: The file.
+        calibration: The result that it is of.
+        verdict: On that result; the comments say no more than it does.
+    """
     comments, header, arbitrary = {}, HEADER, False
     if calibration is not None:
         arbitrary = calibration.covariance.scale_stddev is None
         if arbitrary:
             header = f"{HEADER}\n{ARBITRARY}"
+        if verdict != FITS:
+            header += f"\nVerdict: {verdict}. The reasons are in the summary beside it."
         comments = {
-            camera.name: _comments(rig, calibration, index)
+            camera.name: _comments(rig, calibration, index, verdict)
             for index, camera in enumerate(rig.cameras)
         }
     dump_rig(rig, path, header, comments, arbitrary_scale=arbitrary)
 
 
-def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
+def _comments(
+    rig: Rig, calibration: CalibrationResult, index: int, verdict: str
+) -> list[str]:
     camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
     port = calibration.scene.ports[index]
@@ -41,29 +58,30 @@ def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]
         return ["the images do not determine this housing: no standard deviations"]
     if isinstance(port, DomePort) and camera.refine_center:
         x, y, z = (f"{1e3 * value:.3f}" for value in cov.center_stddev_m)
-        verdict = center_verdict(port.radius, cov, True)
+        word = shown_word(center_verdict(port.radius, cov, True), verdict)
         lines.append(
-            f"center: standard deviation {x}, {y}, {z} {unit}, {verdict} by the images"
+            f"center: standard deviation {x}, {y}, {z} {unit}, {word} by the images"
         )
     if isinstance(port, FlatPort):
-        lines += _flat_comments(camera, port, cov, unit)
+        lines += _flat_comments(camera, port, cov, unit, verdict)
     if index > 0 and calibration.options.refine_cam_from_rig:
         lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
     return lines
 
 
 def _flat_comments(
-    camera: RigCamera, port: FlatPort, cov: CameraCovariance, unit: str
+    camera: RigCamera, port: FlatPort, cov: CameraCovariance, unit: str, verdict: str
 ) -> list[str]:
     lines = []
     if camera.refine_normal:
         lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
-    verdict = distance_verdict(port.distance, cov, camera.refine_distance)
+    word = distance_verdict(port.distance, cov, camera.refine_distance)
+    word = shown_word(word, verdict)
     if cov.distance_at_zero:
-        lines.append(f"distance: {verdict}; the images contradict the lens in air")
+        lines.append(f"distance: {word}; the images contradict the lens in air")
     elif camera.refine_distance:
         lines.append(
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit}, "
-            f"{verdict} by the images"
+            f"{word} by the images"
         )
     return lines

@@ -38,6 +38,8 @@ class Refined:
     """Of ``scene``: its masks and covariances use ``scene``'s indices."""
     start_rms_px: float
     """True error of the kept observations before the first solve, px."""
+    num_tested: int
+    """Observations given, within what the calibrations in air covered."""
 
 
 def rig_options(rig: Rig) -> dict[str, Any]:
@@ -122,6 +124,7 @@ def refine_scene(
         kept=kept,
         calibration=_compact(second, final, still, clicks),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
+        num_tested=int(np.count_nonzero(calibrated)),
     )
 
 
