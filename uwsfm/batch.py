@@ -135,8 +135,8 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
                 log.error("%s", traceback.format_exc())
                 raise
             log.info("verdict: %s", result.verdict.verdict)
-            for reason in result.verdict.reasons:
-                log.info("%s: %s", reason.severity, reason.text)
+            for item in result.verdict.reasons:
+                log.info("%s: %s", item.severity, item.text)
             for warning in result.summary["warnings"]:
                 log.info("note: %s", warning)
             log.info("done")

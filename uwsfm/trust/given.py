@@ -119,7 +119,9 @@ def _port(
                     stated=options.normal_stddev_deg is not None,
                 )
             )
-    if isinstance(after, DomePort) and np.any(refined[border.CENTER]):
+    if not (isinstance(before, DomePort) and isinstance(after, DomePort)):
+        return found
+    if np.any(refined[border.CENTER]):
         stated = options.center_stddev_m
         found.append(
             Departure(

@@ -7,7 +7,7 @@ those take the model for right. Nothing here looks at what is true.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,13 +16,11 @@ from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.trust.bound import pull_below_zero
 from uwsfm.trust.central import fit_lens
 from uwsfm.trust.given import Departure, departures
 from uwsfm.trust.systematic import NOTHING, Systematic, systematic_part
-
-if TYPE_CHECKING:
-    from uwsfm.sfm.noise_floor import NoiseFloor
 
 By = Literal["place", "depth", "row", "camera", "time", "image"]
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
 from uwsfm.trust.departed import departed_reasons
 from uwsfm.trust.goodness import Goodness, Used, goodness_of
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
@@ -19,7 +20,6 @@ from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 if TYPE_CHECKING:
     from uwsfm.calibration.problem import CalibrationResult
     from uwsfm.rig import Rig
-    from uwsfm.sfm.noise_floor import NoiseFloor
 
 Word = Literal["fits", "doubtful", "does not fit"]
 
@@ -84,7 +84,8 @@ def judge(
 
 def judged(rig: Rig, calibration: CalibrationResult, used: Used) -> Verdict:
     """`judge`, with the noise floor of the result's own tracks."""
-    return judge(rig, calibration, None, used)
+    scene, _ = calibration.scene.select(calibration.inliers)
+    return judge(rig, calibration, noise_floor(scene), used)
 
 
 def verdict_on(goodness: Goodness) -> Verdict:
@@ -116,7 +117,7 @@ def _floor(goodness: Goodness) -> list[Reason]:
     text = (
         f"The model leaves {floor.model_px:.2g} px RMS, {floor.ratio:.1f} times the "
         f"{floor.floor_px:.2g} px that the best geometry of each pair of images leaves "
-        "of the same matches: the images agree with each other, but not with this model."
+        "of the same matches: the images agree with each other, not with this model."
     )
     severity = DOES_NOT_FIT if floor.ratio >= FAR_ABOVE_FLOOR else DOUBTFUL
     return [
@@ -172,8 +173,8 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         text = (
             f"Camera {camera.name}: it is the lens, as given, that does not fit. "
             f"{px:.2g} px of the residuals are systematic by place in the image "
-            f"({_chance(camera.p_value)}), and {freed:.2g} px if the lens is free: check "
-            "its calibration, or refine it."
+            f"({_chance(camera.p_value)}), and {freed:.2g} px if the lens is free: "
+            "check its calibration, or refine it."
         )
         numbers = {"px": px, "p_value": camera.p_value, "freed_px": freed}
         reasons.append(reason("lens_does_not_fit", text, severity, **numbers))
