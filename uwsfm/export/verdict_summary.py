@@ -39,7 +39,7 @@ def with_verdict(verdict: Verdict, summary: Mapping[str, Any]) -> dict[str, Any]
         for camera in summary["cameras"]
     ]
     scale = summary["scale"]
-    return {
+    first = {
         "verdict": word,
         "reasons": [
             {
@@ -51,10 +51,10 @@ def with_verdict(verdict: Verdict, summary: Mapping[str, Any]) -> dict[str, Any]
             for reason in verdict.reasons
         ],
         "goodness": plain(verdict.goodness),
-        **summary,
-        "cameras": cameras,
-        "scale": {**scale, "verdict": shown_word(scale["verdict"], word)},
     }
+    rest = {key: value for key, value in summary.items() if key not in first}
+    shown = {**scale, "verdict": shown_word(scale["verdict"], word)}
+    return {**first, **rest, "cameras": cameras, "scale": shown}
 
 
 def verdict_line(summary: Mapping[str, Any]) -> str:
@@ -70,6 +70,17 @@ def verdict_line(summary: Mapping[str, Any]) -> str:
     word = summary["scale"]["verdict"]
     metric = "" if word == ARBITRARY else f" Its scale is {word}."
     return f"Verdict: fits. The model explains the images within their noise.{metric}"
+
+
+def verdict_note(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """What has to be said beside numbers of a result that does not simply fit."""
+    if summary.get("verdict", FITS) == FITS:
+        return ()
+    first = summary["reasons"][0]["text"]
+    return (
+        f"the verdict on this result is {summary['verdict']!r}, so the standard "
+        f"deviations here may be far too small: {first}",
+    )
 
 
 def _count(number: int) -> str:

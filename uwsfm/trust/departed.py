@@ -7,8 +7,9 @@ from uwsfm.trust.given import Departure
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, reason
 
 DEPARTED, FAR_DEPARTED = 4.0, 10.0
-"""Standard deviations of given and estimate. For a port distance whose accuracy was not
-stated they are factors of 3 and 6."""
+"""Standard deviations of given and estimate together; and of what was given alone, for
+an estimate that is moved towards it by three of its own. For a port distance whose
+accuracy was not stated they are factors of 3 and 6."""
 TILTED_DEG, FAR_TILTED_DEG = 15.0, 25.0
 """A port turned by more against the normal given: no mount is so far off by chance, and
 at the second the port would stand in the way of its own lens."""
@@ -64,7 +65,7 @@ def _distance(item: Departure) -> Reason | None:
         f"{1e3 * item.given_stddev:.2g} mm{'' if item.stated else ', assumed'}); "
         "measure it with a ruler, and check lens, baseline and units."
     )
-    severe = unreadable or item.z >= FAR_DEPARTED
+    severe = unreadable or item.z_at_least >= FAR_DEPARTED
     severity = DOES_NOT_FIT if severe else DOUBTFUL
     return reason("port_distance", text, severity, **_numbers(item))
 
@@ -104,10 +105,10 @@ def _focal(item: Departure) -> Reason | None:
         return None
     text = (
         f"Camera {item.camera}: the focal length came out at {item.estimate:.3f} ± "
-        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); was it "
-        "calibrated in air, at this resolution and zoom?"
+        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); check that "
+        "it was calibrated in air, at this resolution and zoom."
     )
-    severity = DOES_NOT_FIT if item.z >= FAR_DEPARTED else DOUBTFUL
+    severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
     return reason("focal_length", text, severity, **_numbers(item))
 
 
@@ -116,10 +117,10 @@ def _principal_point(item: Departure) -> Reason | None:
         return None
     text = (
         f"Camera {item.camera}: the principal point moved by {item.estimate:.3g} ± "
-        f"{item.stddev:.2g} px ({_stated(item, '{:.2g} px')}); was the lens calibrated "
-        "on images of this crop and orientation?"
+        f"{item.stddev:.2g} px ({_stated(item, '{:.2g} px')}); check that the "
+        "lens was calibrated on images of this crop and orientation."
     )
-    severity = DOES_NOT_FIT if item.z >= FAR_DEPARTED else DOUBTFUL
+    severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
     return reason("principal_point", text, severity, **_numbers(item))
 
 

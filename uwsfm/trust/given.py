@@ -63,6 +63,13 @@ class Departure:
         return abs(self.estimate - self.given) / both if math.isfinite(both) else 0.0
 
     @property
+    def z_at_least(self) -> float:
+        """Difference less three standard deviations of the estimate, in standard
+        deviations of what was given."""
+        difference = abs(self.estimate - self.given) - 3.0 * self.stddev
+        return difference / self.given_stddev
+
+    @property
     def at_least(self) -> float:
         """The estimate, less three of its standard deviations."""
         return self.estimate - 3.0 * self.stddev
