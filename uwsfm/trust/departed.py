@@ -105,8 +105,8 @@ def _focal(item: Departure) -> Reason | None:
         return None
     text = (
         f"Camera {item.camera}: the focal length came out at {item.estimate:.3f} ± "
-        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); check that "
-        "it was calibrated in air, at this resolution and zoom."
+        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); check "
+        "that it was calibrated in air, at this resolution and zoom."
     )
     severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
     return reason("focal_length", text, severity, **_numbers(item))
