@@ -164,6 +164,30 @@ def test_a_wrong_lens_is_named_by_its_camera(dive, fitting):
     assert f"{fit.systematic_px:.2g} px" in text and f"{fit.freed_px:.2g} px" in text
 
 
+@pytest.mark.parametrize(
+    "steps",
+    [{"fx": 6.0, "fy": 6.0}, {"cy": 6.0}, {"p1": 0.003}],
+    ids=["focal length 1 %", "principal point 6 px", "p1 0.003"],
+)
+def test_a_lens_that_hides_in_ports_and_poses_is_found_by_freeing_it(dive, steps):
+    """By place, next to nothing is systematic."""
+    scene, rig = dive
+    wrong = with_lens(with_lens(rig, 0, **steps), 1, **steps)
+    verdict = adjusted(scene, wrong)
+    assert verdict.verdict != FITS
+    assert {"lenses_do_not_fit", "lens_does_not_fit"} & set(codes(verdict))
+    free = verdict.goodness.free_lens
+    # Twice eight numbers, of which each saves one noise variance by chance.
+    assert free.num_freed == 16 and free.gain > 3 * 16
+
+
+def test_right_lenses_save_no_more_than_chance_and_refined_ones_are_not_asked(fitting):
+    free = fitting.goodness.free_lens
+    assert free.num_freed == 16
+    # Chi-square of 16 degrees: 0.0001 at both ends.
+    assert 2.0 < free.gain < 45.0 and 1e-4 < free.p_value < 1.0
+
+
 def test_a_baseline_in_another_unit_is_seen_by_the_ports(dive):
     """It fits to the last digit: only the ruler knows."""
     scene, rig = dive

@@ -26,12 +26,13 @@ def pull_below_zero(calibration: CalibrationResult) -> float | None:
         calibration: The result.
 
     Returns:
-        None: no distance ran into zero; or priors and lengths take part in the cost,
-        which this does not weigh.
+        None: no distance ran into zero; or the result is no optimum of the reprojection
+        error alone, as priors and lengths take part.
     """
     at_zero = [camera.distance_at_zero for camera in calibration.covariance.cameras]
     options = calibration.options
     weighed = calibration.entered is not None or options.baseline_stddev_m > 0.0
+    weighed |= options.strategy != "joint" or options.error_name != "reprojection"
     weighed |= any(getattr(options, name) is not None for name in PRIORS)
     if not any(at_zero) or weighed:
         return None

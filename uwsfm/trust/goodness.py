@@ -19,6 +19,7 @@ from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.trust.bound import pull_below_zero
 from uwsfm.trust.central import fit_lens
+from uwsfm.trust.free_lens import FreeLens, free_lens
 from uwsfm.trust.given import Departure, departures
 from uwsfm.trust.systematic import NOTHING, Systematic, systematic_part
 
@@ -89,6 +90,8 @@ class Goodness:
     converged: bool
     departures: tuple[Departure, ...]
     """Estimates against what was given."""
+    free_lens: FreeLens | None
+    """What vanishes of the residuals with the lenses free; None: it cannot be told."""
     below_zero_z: float | None
     """See `pull_below_zero`; None: no port distance ran into zero."""
     known_length_z: float | None
@@ -128,6 +131,7 @@ def goodness_of(
         used=used,
         converged=calibration.summary.converged,
         departures=departures(rig, calibration),
+        free_lens=free_lens(calibration),
         below_zero_z=pull_below_zero(calibration),
         known_length_z=None
         if lengths is None

@@ -165,7 +165,7 @@ def _systematic(goodness: Goodness) -> list[Reason]:
 
 
 def _lenses(goodness: Goodness) -> list[Reason]:
-    """Cameras whose residuals a free lens would remove."""
+    """Cameras whose residuals a free lens would remove, or all of them together."""
     reasons = []
     for camera in goodness.cameras:
         px, freed = camera.systematic_px, camera.freed_px
@@ -180,7 +180,19 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         )
         numbers = {"px": px, "p_value": camera.p_value, "freed_px": freed}
         reasons.append(reason("lens_does_not_fit", text, severity, **numbers))
-    return reasons
+    free = goodness.free_lens
+    if reasons or free is None:
+        return reasons
+    severity = _severity(free.px, free.p_value, goodness.sigma_px)
+    if severity is None:
+        return []
+    text = (
+        f"With the lenses free, {free.px:.2g} px of the residuals vanish "
+        f"({_chance(free.p_value)}): the lenses, as given, do not fit, or something "
+        "that a lens can stand for; check their calibration."
+    )
+    numbers = {"px": free.px, "p_value": free.p_value, "gain": free.gain}
+    return [reason("lenses_do_not_fit", text, severity, **numbers)]
 
 
 def _severity(px: float, p_value: float, sigma_px: float) -> Severity | None:
