@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.padding import Padding
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -95,7 +96,8 @@ def print_verdict(summary: dict[str, Any]) -> None:
     style = _STYLES.get(summary.get("verdict", ""), "")
     console.print(Text(verdict_line(summary), style=style))
     for reason in summary.get("reasons", ()):
-        console.print(Text(f"  {reason['severity']}: {reason['text']}"))
+        line = Text(f"{reason['severity']}: {reason['text']}")
+        console.print(Padding(line, (0, 0, 0, 2)))
 
 
 # Three numbers and their deviations side by side do not fit a narrow terminal.

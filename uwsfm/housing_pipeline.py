@@ -34,7 +34,6 @@ from uwsfm.pipeline import (
     locked,
     output_folder,
     refined_rig,
-    refined_verdict,
     require_effect,
     scene_distance,
     start_scene,
@@ -51,7 +50,7 @@ from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.trust.goodness import Used
-from uwsfm.trust.verdict import Verdict, judged
+from uwsfm.trust.verdict import Verdict, judged, refined_verdict
 
 Start = Literal["virtual", "paper", "pairs"]
 
@@ -188,6 +187,7 @@ class _Job:
             options = {"lengths": lengths, **self.options}
             refined = refine_scene(scene, self.rig, self.progress, **options)
             calibration = refined.calibration
+            self.progress("judging the fit", 0, None)
             verdict = refined_verdict(self.rig, refined, num_frames)
         notes = () if model is None else model.warnings
         return self._finish(calibration, verdict, notes)

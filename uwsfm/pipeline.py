@@ -57,8 +57,7 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
-from uwsfm.trust.goodness import Used
-from uwsfm.trust.verdict import Verdict, judged
+from uwsfm.trust.verdict import Verdict, refined_verdict
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,10 +201,12 @@ class _Job:
         refined = self._refined(start, arrays)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
+        self.progress("judging the fit", 0, None)
+        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
+        timings["judging the fit"] = time.perf_counter() - clock
+        clock, word = time.perf_counter(), verdict.verdict
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
-        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
-        word = verdict.verdict
         export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
@@ -236,23 +237,6 @@ class _Job:
             lengths=lengths,
             **self.calibration,
         )
-
-
-def refined_verdict(rig: Rig, refined: Refined, num_frames: int) -> Verdict:
-    """The verdict on a refined scene.
-
-    Args:
-        rig: As given.
-        refined: The result.
-        num_frames: That there were, registered or not.
-    """
-    used = Used(
-        num_frames=num_frames,
-        num_registered=len(np.unique(refined.scene.frame_idx)),
-        num_tested=refined.num_tested,
-        num_kept=len(refined.kept),
-    )
-    return judged(rig, refined.calibration, used)
 
 
 def compiled(num_threads: int, progress: Progress) -> dict[str, float]:

@@ -38,7 +38,6 @@ from uwsfm.pipeline import (
     locked,
     output_folder,
     refined_rig,
-    refined_verdict,
     require_effect,
     scene_distance,
 )
@@ -63,7 +62,7 @@ from uwsfm.sfm.refine import (
     rig_options,
     without_empty_frames,
 )
-from uwsfm.trust.verdict import Verdict
+from uwsfm.trust.verdict import Verdict, refined_verdict
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 """Camera models without distortion: light through a flat port never fits them."""
@@ -241,10 +240,13 @@ class _Job:
         self.timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]
+        self.progress("judging the fit", 0, None)
+        verdict = refined_verdict(self.rig, refined, len(tracks.frame_names))
+        self.timings["judging the fit"] = time.perf_counter() - clock
+        clock, word = time.perf_counter(), verdict.verdict
         model, refined = self._model(refined, tracks)
         export_colmap(model, self.out / SPARSE)
-        verdict = refined_verdict(self.rig, refined, len(tracks.frame_names))
-        word, calibration = verdict.verdict, refined.calibration
+        calibration = refined.calibration
         export_housing(model.rig, self.out / HOUSING, calibration, verdict=word)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from uwsfm._indices import distinct
 from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
 from uwsfm.trust.departed import departed_reasons
 from uwsfm.trust.goodness import Goodness, Used, goodness_of
@@ -20,6 +21,7 @@ from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 if TYPE_CHECKING:
     from uwsfm.calibration.problem import CalibrationResult
     from uwsfm.rig import Rig
+    from uwsfm.sfm.refine import Refined
 
 Word = Literal["fits", "doubtful", "does not fit"]
 
@@ -88,6 +90,23 @@ def judged(rig: Rig, calibration: CalibrationResult, used: Used) -> Verdict:
     """`judge`, with the noise floor of the result's own tracks."""
     scene, _ = calibration.scene.select(calibration.inliers)
     return judge(rig, calibration, noise_floor(scene), used)
+
+
+def refined_verdict(rig: Rig, refined: Refined, num_frames: int) -> Verdict:
+    """The verdict on a refined scene.
+
+    Args:
+        rig: As given.
+        refined: The result.
+        num_frames: That there were, registered or not.
+    """
+    used = Used(
+        num_frames=num_frames,
+        num_registered=len(distinct(refined.scene.frame_idx)),
+        num_tested=refined.num_tested,
+        num_kept=len(refined.kept),
+    )
+    return judged(rig, refined.calibration, used)
 
 
 def verdict_on(goodness: Goodness) -> Verdict:
