@@ -14,6 +14,7 @@ from uwsfm.sfm.refine import refine_scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, paper_rig, sample_rig, tilted_normal
 from uwsfm.simulate.trajectories import lawn_mower, rich_motion, straight_strip
+from uwsfm.trust import free_lens as free_lens_module
 from uwsfm.trust.given import Departure
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.verdict import (
@@ -377,3 +378,18 @@ def test_the_numbers_are_those_of_the_arrays(dive):
         item = by_what[before.name, "distance_m"]
         assert item.given == before.port.distance and item.estimate == port.distance
         assert item.stddev == camera.distance_stddev_m
+
+
+def test_a_large_scene_is_asked_by_some_of_its_frames(dive, monkeypatch):
+    scene, rig = dive
+    monkeypatch.setattr(free_lens_module, "MAX_OBSERVATIONS", 2000)
+    monkeypatch.setattr(free_lens_module, "PART", 1500)
+    right = refine_scene(replace(scene, cameras=rig.refractive_cameras()), rig)
+    found = free_lens_module.free_lens(right.calibration)
+    part = free_lens_module._some_frames(right.scene)
+    assert 1500 <= part.num_observations < right.scene.num_observations
+    assert 1 < part.num_frames < scene.num_frames
+    assert found.p_value > 1e-4
+    lens = with_lens(with_lens(rig, 0, p1=0.006), 1, p1=0.006)
+    wrong = refine_scene(replace(scene, cameras=lens.refractive_cameras()), lens)
+    assert free_lens_module.free_lens(wrong.calibration).p_value < LEVEL
