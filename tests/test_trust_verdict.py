@@ -218,6 +218,8 @@ def test_a_held_rotation_that_is_wrong_lies_above_the_noise_floor(dive):
     assert verdict.verdict == DOES_NOT_FIT
     assert "above_noise_floor" in codes(verdict)
     assert "lens_does_not_fit" not in codes(verdict)  # it is exact
+    free = [r.text for r in verdict.reasons if r.code == "lenses_do_not_fit"]
+    assert all("not the lenses alone" in text for text in free)
     floor = verdict.goodness.floor
     (text,) = [r.text for r in verdict.reasons if r.code == "above_noise_floor"]
     assert f"{floor.model_px:.2g} px RMS" in text and f"{floor.ratio:.1f}" in text

@@ -49,6 +49,8 @@ class FreeLens:
     """Squares saved, in variances of the noise."""
     num_freed: int
     """Numbers that were free."""
+    sigma_px: float
+    """Noise of one coordinate that is left then."""
 
 
 def free_lens(calibration: CalibrationResult) -> FreeLens | None:
@@ -89,6 +91,7 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
         p_value=float(chi2.sf(gain, count)),
         gain=gain,
         num_freed=count,
+        sigma_px=after.sigma_px,
     )
 
 

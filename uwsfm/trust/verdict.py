@@ -207,9 +207,20 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         return []
     text = (
         f"With the lenses free, {free.px:.2g} px of the residuals vanish "
-        f"({_chance(free.p_value)}): the lenses, as given, do not fit, or something "
-        "that a lens can stand for; check their calibration."
+        f"({_chance(free.p_value)}): "
     )
+    floor = goodness.floor
+    if floor is None or free.sigma_px < ABOVE_FLOOR * floor.floor_px:
+        text += (
+            "the lenses, as given, do not fit, or something that a lens can stand for; "
+            "check their calibration."
+        )
+    else:
+        text += (
+            f"but a noise of {free.sigma_px:.2g} px is left, where pairs of images "
+            f"alone have {floor.floor_px:.2g} px, so it is not the lenses alone; check "
+            "the placement of the cameras and the ports as well."
+        )
     numbers = {"px": free.px, "p_value": free.p_value, "gain": free.gain}
     return [reason("lenses_do_not_fit", text, severity, **numbers)]
 
