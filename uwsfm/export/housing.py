@@ -58,10 +58,8 @@ def _comments(
         return ["the images do not determine this housing: no standard deviations"]
     if isinstance(port, DomePort) and camera.refine_center:
         x, y, z = (f"{1e3 * value:.3f}" for value in cov.center_stddev_m)
-        word = shown_word(center_verdict(port.radius, cov, True), verdict)
-        lines.append(
-            f"center: standard deviation {x}, {y}, {z} {unit}, {word} by the images"
-        )
+        word = _by_images(center_verdict(port.radius, cov, True), verdict)
+        lines.append(f"center: standard deviation {x}, {y}, {z} {unit}, {word}")
     if isinstance(port, FlatPort):
         lines += _flat_comments(camera, port, cov, unit, verdict)
     if index > 0 and calibration.options.refine_cam_from_rig:
@@ -76,12 +74,17 @@ def _flat_comments(
     if camera.refine_normal:
         lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
     word = distance_verdict(port.distance, cov, camera.refine_distance)
-    word = shown_word(word, verdict)
     if cov.distance_at_zero:
         lines.append(f"distance: {word}; the images contradict the lens in air")
     elif camera.refine_distance:
         lines.append(
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit}, "
-            f"{word} by the images"
+            f"{_by_images(word, verdict)}"
         )
     return lines
+
+
+def _by_images(word: str, verdict: str) -> str:
+    """How well the images determine a number, as far as the verdict allows to say."""
+    shown = shown_word(word, verdict)
+    return f"{word} by the images" if shown == word else f"{shown}: see the verdict"
