@@ -11,6 +11,7 @@ import re
 import reprlib
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import yaml
 from pydantic import ValidationError
 
 from uwsfm._files import replaced_file
+from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
 from uwsfm.models.port import DomePort, NoPort
@@ -31,7 +33,7 @@ from uwsfm.rig_schema import (
     RadialUndistortionLens,
     RigFile,
 )
-from uwsfm.rig_values import ARBITRARY_SCALE, checked_baseline
+from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, checked_baseline
 
 FRESH_WATER = 1.333
 
@@ -68,15 +70,17 @@ def load_rig(path: str | Path) -> Rig:
     token = None
     try:
         data = read_yaml(Path(path))
-        token = ARBITRARY_SCALE.set(data.get("scale") == "arbitrary")
-        return _to_rig(RigFile.model_validate(data))
+        # What the images estimated stands, however far it is from any housing.
+        anything = data.get("scale") == "arbitrary" or data.get("estimated") is True
+        token = IMPLAUSIBLE_ALLOWED.set(anything)
+        return _to_rig(RigFile.model_validate(data), Path(path).parent)
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     finally:
         if token is not None:
-            ARBITRARY_SCALE.reset(token)
+            IMPLAUSIBLE_ALLOWED.reset(token)
 
 
 def read_yaml(path: Path) -> dict:
@@ -103,7 +107,7 @@ def read_yaml(path: Path) -> dict:
     return data
 
 
-def _to_rig(file: RigFile) -> Rig:
+def _to_rig(file: RigFile, folder: Path) -> Rig:
     poses: list[Any] = [IDENTITY]
     baseline = None
     for i, entry in enumerate(file.cameras):
@@ -115,13 +119,23 @@ def _to_rig(file: RigFile) -> Rig:
         if i == 1:
             baseline = entry.baseline_m or float(np.linalg.norm(poses[1][4:]))
     water = file.water.refractive_index
-    return Rig(
+    if isinstance(file.accuracy, str):
+        accuracy = RigAccuracy(exact=True)
+    else:
+        try:
+            accuracy = file.accuracy.to_accuracy(folder)
+        except InputError as error:
+            raise InputError(f"accuracy.covariance: {error}") from None
+    rig = Rig(
         cameras=tuple(_rig_camera(entry, water) for entry in file.cameras),
         cam_from_rig=np.array(poses) if len(poses) == len(file.cameras) else None,
         baseline_m=baseline,
         baseline_stddev_m=file.baseline_stddev_m,
         refine_cam_from_rig=file.refine_cam_from_rig,
+        accuracy=accuracy,
     )
+    rig.given_accuracy()  # refuses what this rig does not have
+    return rig
 
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
@@ -142,6 +156,7 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         valid_radius_px=lens.valid_radius_px,
         conversion_max_px=conversion.max_px if conversion else None,
         conversion_rms_px=conversion.rms_px if conversion else None,
+        accuracy=entry.accuracy.to_accuracy(),
     )
 
 
@@ -274,6 +289,7 @@ def dump_rig(
     comments: Mapping[str, Sequence[str]] | None = None,
     *,
     arbitrary_scale: bool = False,
+    estimated: bool = False,
 ) -> None:
     """Write a rig.yaml that `load_rig` reads back to the same values.
 
@@ -283,6 +299,7 @@ def dump_rig(
         header_comment: Lines for the top of the file, without "#".
         comments: Lines above a camera, by its name; say, standard deviations.
         arbitrary_scale: Its lengths have no unit.
+        estimated: It is a result: a length that no housing has is read back as well.
     """
     comments = comments or {}
     unknown = set(comments) - {camera.name for camera in rig.cameras}
@@ -298,6 +315,9 @@ def dump_rig(
     if len(rig.cameras) > 1:
         top["baseline_stddev_m"] = float(rig.baseline_stddev_m)
         top["refine_cam_from_rig"] = rig.refine_cam_from_rig
+    if estimated:
+        top["estimated"] = True
+    top |= _shared_accuracy(rig.accuracy)
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):
         lines = [*comments.get(camera.name, ()), *_conversion_lines(camera)]
@@ -333,12 +353,36 @@ def _block(rig: Rig, i: int) -> dict[str, Any]:
     }
     if camera.valid_radius_px is not None:
         block["intrinsics"]["valid_radius_px"] = camera.valid_radius_px
+    own = {key: value for key, value in asdict(camera.accuracy).items() if value is not None}
+    if own:
+        block["accuracy"] = {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in own.items()
+        }
     if i > 0 and rig.cam_from_rig is None:
         block["baseline_m"] = rig.baseline_m
     elif i > 0 and rig.cam_from_rig is not None:
         pose = rig.cam_from_rig[i].tolist()
         block["cam_from_rig"] = {"rotation_xyzw": pose[:4], "translation_m": pose[4:]}
     return block
+
+
+def _shared_accuracy(accuracy: RigAccuracy) -> dict[str, Any]:
+    """The key "accuracy" of the file; nothing if all of it is assumed."""
+    if accuracy.exact:
+        return {"accuracy": "exact"}
+    found: dict[str, Any] = {}
+    for key in ("baseline_m", "water_index"):
+        if getattr(accuracy, key) is not None:
+            found[key] = getattr(accuracy, key)
+    if accuracy.covariance is not None:
+        found["covariance"] = {
+            "names": list(accuracy.covariance.names),
+            "matrix": accuracy.covariance.matrix.tolist(),
+        }
+    if accuracy.lens_prior != "independent":
+        found["lens_prior"] = accuracy.lens_prior
+    return {"accuracy": found} if found else {}
 
 
 def _common_water(rig: Rig) -> float:

@@ -28,7 +28,14 @@ def export_housing(
             camera.name: _comments(rig, calibration, index)
             for index, camera in enumerate(rig.cameras)
         }
-    dump_rig(rig, path, header, comments, arbitrary_scale=arbitrary)
+    dump_rig(
+        rig,
+        path,
+        header,
+        comments,
+        arbitrary_scale=arbitrary,
+        estimated=calibration is not None,
+    )
 
 
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
