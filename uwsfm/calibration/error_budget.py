@@ -9,7 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm.calibration.given_errors import GivenReach, given_reach
+from uwsfm.calibration.given_errors import (
+    GivenReach,
+    given_reach,
+    with_given_errors,
+)
 from uwsfm.calibration.given_items import GivenItem, given_items
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry import unit_vector
@@ -20,7 +24,6 @@ from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 
 TOGETHER = "all of these together"
-
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +89,16 @@ def error_budget(
     sheet = _Sheet(calibration, reach)
     rows = sorted(sheet.rows(), key=lambda row: -np.nan_to_num(row.share, nan=np.inf))
     return (*rows, sheet.together())
+
+
+def with_budget(
+    calibration: CalibrationResult,
+) -> tuple[CalibrationResult, tuple[BudgetRow, ...]]:
+    """The calibration with its deviations "in all", and its error budget: what a
+    pipeline does once, at its end."""
+    reach = given_reach(calibration)
+    calibration = with_given_errors(calibration, reach)
+    return calibration, error_budget(calibration, reach)
 
 
 class _Sheet:

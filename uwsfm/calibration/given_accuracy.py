@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uwsfm.calibration.named_covariance import NamedCovariance, steps_of_names
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
@@ -25,9 +26,9 @@ CORNER = 0.005
 distance from the centre: 0.01 of k1 for a lens whose corners are 35 degrees off."""
 TANGENTIAL = 1e-3
 NEXT_COEFFICIENT = -0.9
-"""Correlation of k1 with k2, k2 with k3 ... if they are not given as a covariance: every
-calibration trades one for the next. Together they move the corner by a pixel or so, as
-two calibrations of one lens differ."""
+"""Correlation of k1 with k2, k2 with k3 ... if they are not given as a covariance, for
+every calibration trades one for the next. Together they move the corner by a pixel or
+so, as two calibrations of one lens differ."""
 FX_AGAINST_FY = 0.99
 """Correlation of fx and fy: pixels are square to a tenth of the focal accuracy."""
 GLASS_INDEX = 0.01
@@ -82,47 +83,6 @@ class CameraAccuracy:
     rotation_deg: float | None = None
     """Per axis of the camera."""
     direction_deg: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NamedCovariance:
-    """A covariance as a calibration yields it, with the name of every row.
-
-    Names are CAMERA.PARAMETER: those of the lens model (fx, k1, ...), rotation_x, _y,
-    _z (radians, about the axes of that camera) and translation_x, _y, _z (metres).
-    """
-
-    names: tuple[str, ...]
-    matrix: Array
-
-    def __post_init__(self) -> None:
-        matrix = np.array(self.matrix, dtype=np.float64)
-        count = len(self.names)
-        if len(set(self.names)) < count:
-            twice = next(n for n in self.names if self.names.count(n) > 1)
-            raise InputError(f"names: {twice!r} is there twice")
-        if matrix.shape != (count, count):
-            raise InputError(
-                f"matrix: must be {count} x {count}, one row for each name, got shape "
-                f"{matrix.shape}"
-            )
-        if not np.all(np.isfinite(matrix)):
-            raise InputError("matrix: holds numbers that are not finite")
-        spread = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        if not np.all(spread > 0.0):
-            name = self.names[int(np.argmin(spread))]
-            raise InputError(f"matrix: the variance of {name} is not positive")
-        scaled = matrix / np.outer(spread, spread)
-        if np.abs(scaled - scaled.T).max() > 1e-6:
-            raise InputError("matrix: is not symmetric")
-        # Rounded to six digits, a good covariance may come out as -1e-6.
-        least = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
-        if least < 1e-9:
-            raise InputError(
-                "matrix: is not positive definite (smallest eigenvalue of the "
-                f"correlations {least:.2g})"
-            )
-        object.__setattr__(self, "matrix", 0.5 * (matrix + matrix.T))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,7 +177,9 @@ def given_accuracy(
         _lens(camera, stddevs[c], assumed[c])
         _port(camera, stddevs[c], assumed[c])
         if camera.port != "none":
-            _set(stddevs[c], assumed[c], border.WATER_INDEX, rig.water_index, WATER_INDEX)
+            _set(
+                stddevs[c], assumed[c], border.WATER_INDEX, rig.water_index, WATER_INDEX
+            )
         if c > 0:
             _placement(camera, rig, baseline_m, stddevs[c], assumed[c])
     covariance = np.diag(stddevs.ravel() ** 2)
@@ -303,9 +265,7 @@ def _placement(
 ) -> None:
     accuracy, radian = camera.accuracy, float(np.radians(1.0))
     length = float(np.linalg.norm(camera.translation)) or baseline_m or 0.0
-    _set(
-        stddevs, assumed, border.ROTATION, accuracy.rotation_deg, ROTATION_DEG, radian
-    )
+    _set(stddevs, assumed, border.ROTATION, accuracy.rotation_deg, ROTATION_DEG, radian)
     _set(
         stddevs,
         assumed,
@@ -314,9 +274,7 @@ def _placement(
         DIRECTION_DEG,
         radian,
     )
-    _set(
-        stddevs, assumed, border.LENGTH, rig.baseline_m, BASELINE_SHARE * length
-    )
+    _set(stddevs, assumed, border.LENGTH, rig.baseline_m, BASELINE_SHARE * length)
 
 
 def _couple_lenses(
@@ -360,7 +318,7 @@ def _replace_named(
     """Put a named covariance in the place of the single deviations."""
     named = rig.covariance
     assert named is not None
-    onto = _steps_of_names(cameras, named.names)
+    onto = steps_of_names(cameras, named.names)
     touched = np.flatnonzero(np.any(onto != 0.0, axis=1))
     lengths = touched % border.BORDER_SIZE == border.LENGTH
     if rig.baseline_m is not None and np.any(lengths):
@@ -372,54 +330,3 @@ def _replace_named(
     covariance[:, touched] = 0.0
     covariance += onto @ named.matrix @ onto.T
     assumed.reshape(-1)[touched] = False
-
-
-def _steps_of_names(
-    cameras: Sequence[GivenCamera], names: tuple[str, ...]
-) -> Array:
-    """(C BORDER_SIZE, K) steps of the border by the named parameters."""
-    by_name = {camera.name: c for c, camera in enumerate(cameras)}
-    onto = np.zeros((len(cameras) * border.BORDER_SIZE, len(names)))
-    shifts: dict[int, dict[int, int]] = {}
-    for k, name in enumerate(names):
-        camera_name, _, parameter = name.rpartition(".")
-        c = by_name.get(camera_name)
-        if c is None:
-            raise InputError(
-                f"accuracy.covariance: {name!r} is of no camera of this rig; write "
-                f"{cameras[0].name}.fx, with the name of a camera"
-            )
-        first = c * border.BORDER_SIZE
-        camera, axis = cameras[c], "xyz".find(parameter[-1:])
-        if parameter in camera.param_names:
-            slot = camera.slots[camera.param_names.index(parameter)]
-            onto[first + border.FIRST_LENS + slot, k] = 1.0
-            if slot == 0 and 1 not in camera.slots:
-                onto[first + border.FIRST_LENS + 1, k] = 1.0
-        elif c > 0 and axis >= 0 and parameter[:-1] == "rotation_":
-            onto[first + axis, k] = 1.0
-        elif c > 0 and axis >= 0 and parameter[:-1] == "translation_":
-            shifts.setdefault(c, {})[axis] = k
-        else:
-            poses = "" if c == 0 else ", rotation_x to _z, translation_x to _z"
-            raise InputError(
-                f"accuracy.covariance: {name!r} is no parameter; those of "
-                f"{camera.name} are {', '.join(camera.param_names)}{poses}"
-            )
-    for c, columns in shifts.items():
-        if len(columns) < 3 or not np.any(cameras[c].translation):
-            raise InputError(
-                f"accuracy.covariance: the translation of {cameras[c].name} needs x, "
-                "y and z, and cam_from_rig"
-            )
-        arm = _arm(cameras[c].translation)
-        rows = c * border.BORDER_SIZE + np.array([3, 4, border.LENGTH])
-        onto[np.ix_(rows, [columns[i] for i in range(3)])] = np.linalg.inv(arm.T)
-    return onto
-
-
-def _arm(translation: Array) -> Array:
-    """(3, 3) rows: derivative of a translation by direction (2) and length."""
-    from uwsfm.solver.state import translation_arm  # compiles kernels
-
-    return translation_arm(np.asarray(translation)).reshape(3, 3)

@@ -7,7 +7,6 @@ with C the covariance of what is given, the estimates' own grows by A C A^T, A =
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -285,15 +284,15 @@ def in_all(calibration: CalibrationResult, reach: GivenReach) -> InAll:
     ):
         dome = isinstance(calibration.scene.ports[c], DomePort)
         more = camera_variances(added, every[c], pose, dome)
-        total = _variances(own) + np.maximum(more, 0.0)
+        total = _variances(own) + np.clip(more, 0.0, None)
         cameras.append(camera_covariance(total, own.distance_at_zero))
     free = columns != HELD
     onto = np.zeros(len(covariance.border), dtype=np.int64)
     onto[columns[free]] = every[free]
     scale = covariance.scale_stddev
     if scale is not None:
-        more = max(float(reach.added(reach.scale_step[None])[0, 0]), 0.0)
-        scale = float(np.sqrt(scale**2 + more))
+        by_given = max(float(reach.added(reach.scale_step[None])[0, 0]), 0.0)
+        scale = float(np.sqrt(scale**2 + by_given))
     return InAll(
         cameras=tuple(cameras),
         border=covariance.border + added[np.ix_(onto, onto)],

@@ -40,7 +40,7 @@ def small_unit(scale_stddev: float | None) -> str:
 def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     """One sentence for everything that is doubtful about scale and place."""
     sentences = []
-    stddev = result.covariance.scale_stddev
+    stddev = result.covariance.judged_scale_stddev
     word = scale_verdict(stddev)
     if word == ARBITRARY:
         sentences.append(

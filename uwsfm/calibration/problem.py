@@ -39,6 +39,7 @@ PRIORS = (
 LENS_PRIORS = PRIORS[4:]
 LENS_PARTS = ("focal", "principal_point", "distortion")
 
+
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
     """Options of `uwsfm.calibrate`."""
@@ -322,10 +323,10 @@ class Covariance:
     """False: the data leave some direction of the refined parameters free, and every
     standard deviation is NaN."""
     scale_stddev: float | None
-    """Relative standard deviation of the factor that all point-to-point distances share,
-    see `uwsfm.calibration.scale`. None: nothing determines the scale, every length is
-    in an arbitrary unit, and what is said of lengths takes one distance between two
-    frames for known."""
+    """Relative standard deviation of the factor that all distances of points share, see
+    `uwsfm.calibration.scale`. None: nothing determines the scale, every length is in an
+    arbitrary unit, and what is said of lengths takes one distance between two frames
+    for known."""
     in_all: InAll | None = None
     """With the errors of what was given, see `uwsfm.calibration.given_errors`; all of
     the above is from the images and priors alone."""

@@ -193,7 +193,8 @@ def predict_covariance(
     variance = noise_px**2
     scale = None
     if not outside.hold_scale:
-        scale = noise_px * float(np.sqrt(_scale_variance(layout, state, eqs, reduced)[0]))
+        unit_variance = _scale_variance(layout, state, eqs, reduced)[0]
+        scale = noise_px * float(np.sqrt(unit_variance))
     border = variance * reduced.border
     return Covariance(
         border=border,

@@ -41,36 +41,51 @@ def export_housing(
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
     camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
+    in_all = calibration.covariance.judged_cameras[index]
     port = calibration.scene.ports[index]
     unit = small_unit(calibration.covariance.scale_stddev)
     lines = []
     if not calibration.covariance.determined:
         return ["the images do not determine this housing: no standard deviations"]
     if isinstance(port, DomePort) and camera.refine_center:
-        x, y, z = (f"{1e3 * value:.3f}" for value in cov.center_stddev_m)
-        verdict = center_verdict(port.radius, cov, True)
+        own, total = (
+            ", ".join(f"{1e3 * value:.3f}" for value in c.center_stddev_m)
+            for c in (cov, in_all)
+        )
+        verdict = center_verdict(port.radius, in_all, True)
         lines.append(
-            f"center: standard deviation {x}, {y}, {z} {unit}, {verdict} by the images"
+            f"center: standard deviation {own} {unit} from the images, {total} in all: "
+            f"{verdict}"
         )
     if isinstance(port, FlatPort):
-        lines += _flat_comments(camera, port, cov, unit)
+        lines += _flat_comments(camera, port, (cov, in_all), unit)
     if index > 0 and calibration.options.refine_cam_from_rig:
-        lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
+        lines.append(
+            f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg from the "
+            f"images, {in_all.rotation_stddev_deg:.4f} in all"
+        )
     return lines
 
 
 def _flat_comments(
-    camera: RigCamera, port: FlatPort, cov: CameraCovariance, unit: str
+    camera: RigCamera,
+    port: FlatPort,
+    both: tuple[CameraCovariance, CameraCovariance],
+    unit: str,
 ) -> list[str]:
+    cov, in_all = both
     lines = []
     if camera.refine_normal:
-        lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
-    verdict = distance_verdict(port.distance, cov, camera.refine_distance)
+        lines.append(
+            f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg from the "
+            f"images, {in_all.normal_stddev_deg:.4f} in all"
+        )
+    verdict = distance_verdict(port.distance, in_all, camera.refine_distance)
     if cov.distance_at_zero:
         lines.append(f"distance: {verdict}; the images contradict the lens in air")
     elif camera.refine_distance:
         lines.append(
-            f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit}, "
-            f"{verdict} by the images"
+            f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit} "
+            f"from the images, {1e3 * in_all.distance_stddev_m:.3f} in all: {verdict}"
         )
     return lines
