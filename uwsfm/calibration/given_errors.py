@@ -105,6 +105,8 @@ class GivenReach:
     optimum: Optimum
     layout: Layout
     """With a column for every given number, after those of what is refined."""
+    eqs: NormalEquations
+    """Of this layout."""
     accuracy: GivenAccuracy
     given: IndexArray
     """(G, 2) camera and slot of each given number: first what is held, then what is
@@ -198,6 +200,7 @@ def given_reach(calibration: CalibrationResult) -> GivenReach:
     return GivenReach(
         optimum=optimum,
         layout=layout,
+        eqs=eqs,
         accuracy=accuracy,
         given=given,
         num_held=int(np.count_nonzero(held)),

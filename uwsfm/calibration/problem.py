@@ -339,7 +339,10 @@ class Covariance:
     @property
     def judged_scale_stddev(self) -> float | None:
         """The same, of the scale."""
-        return self.scale_stddev if self.in_all is None else self.in_all.scale_stddev
+        own = self.scale_stddev
+        if own is None or not np.isfinite(own) or self.in_all is None:
+            return own
+        return self.in_all.scale_stddev
 
 
 @dataclass(frozen=True, kw_only=True)
