@@ -215,11 +215,13 @@ _SHIFTS: dict[str, tuple[str, ...]] = {
 
 
 BUDGET_ROWS = 12
-"""Largest effects that the console shows; the files have all of them."""
+"""Effects that the console shows of a calibration; the files have all of them."""
+FEW_BUDGET_ROWS = 4
+"""The same, of a reconstruction."""
 
 
-def budget_table(summary: dict[str, Any]) -> Table:
-    """What errors of the given numbers would do to the housing."""
+def budget_table(summary: dict[str, Any], num_rows: int = BUDGET_ROWS) -> Table:
+    """What errors of the given numbers would do to the housing, the largest first."""
     *rows, total = summary["error_budget"]
     table = Table(
         title="If a given number is wrong by one standard deviation, then",
@@ -233,11 +235,11 @@ def budget_table(summary: dict[str, Any]) -> Table:
             text = what.format(summary["scale"]["small_unit"])
             table.add_column(f"{name}\n{text}", justify="right")
     table.add_column("lengths\n(%)", justify="right")
-    for row in rows[:BUDGET_ROWS]:
+    for row in rows[:num_rows]:
         by = f"{row['amount']} ({row['deviation']})"
         table.add_row(row["if"], by, *_budget_cells(summary, row, "+"))
-    if len(rows) > BUDGET_ROWS:
-        table.add_row(f"and {len(rows) - BUDGET_ROWS} smaller ones: see the file")
+    if len(rows) > num_rows:
+        table.add_row(f"and {len(rows) - num_rows} smaller ones: see the file")
     table.add_section()
     table.add_row("all, correlated (±)", "", *_budget_cells(summary, total, ""))
     return table

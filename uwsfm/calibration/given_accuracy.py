@@ -6,8 +6,8 @@ it becomes one covariance over the parameters of `uwsfm.residuals.border`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,7 +97,7 @@ class RigAccuracy:
     lens_prior: Literal["independent", "correlated"] = "independent"
     """"correlated": lens parameters that are refined have the covariance as a prior."""
     exact: bool = False
-    """Every given number is exact, in a simulation."""
+    """What has no standard deviation here or in its camera is exact: a simulation."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,15 +142,6 @@ class GivenCamera:
     accuracy: CameraAccuracy = CameraAccuracy()
 
 
-def exact_accuracy(num_cameras: int) -> GivenAccuracy:
-    """Of a simulation: nothing that is given is wrong."""
-    size = num_cameras * border.BORDER_SIZE
-    return GivenAccuracy(
-        covariance=np.zeros((size, size)),
-        assumed=np.zeros((num_cameras, border.BORDER_SIZE), dtype=bool),
-    )
-
-
 def given_accuracy(
     cameras: Sequence[GivenCamera], rig: RigAccuracy, baseline_m: float | None = None
 ) -> GivenAccuracy:
@@ -166,9 +157,9 @@ def given_accuracy(
     """
     names = tuple(camera.name for camera in cameras)
     if rig.exact:
-        found = exact_accuracy(len(cameras))
-        return GivenAccuracy(
-            covariance=found.covariance, assumed=found.assumed, names=names
+        cameras = [replace(c, accuracy=_otherwise_exact(c)) for c in cameras]
+        rig = replace(
+            rig, baseline_m=rig.baseline_m or 0.0, water_index=rig.water_index or 0.0
         )
     size = border.BORDER_SIZE
     stddevs = np.zeros((len(cameras), size))
@@ -193,6 +184,17 @@ def given_accuracy(
         names=names,
         correlated_prior=rig.lens_prior == "correlated",
     )
+
+
+def _otherwise_exact(camera: GivenCamera) -> CameraAccuracy:
+    """What is not said to be inexact is exact."""
+    own = asdict(camera.accuracy)
+    coefficients = sum(slot > 3 for slot in camera.slots)
+    zeros: dict[str, Any] = {**dict.fromkeys(own, 0.0), "distortion": ()}
+    if coefficients:
+        zeros["distortion"] = (0.0,) * coefficients
+    given = {name: value for name, value in own.items() if value is not None}
+    return CameraAccuracy(**{**zeros, **given})
 
 
 def _set(

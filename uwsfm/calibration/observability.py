@@ -169,12 +169,11 @@ class _Causes:
         worst = max(single, key=lambda row: size(row.shifts[camera]), default=None)
         if worst is None:
             return None
-        word = "as assumed" if worst.assumed else "as given"
+        word = "assumed" if worst.assumed else "given"
         return (
-            f"the images alone would determine it; errors of what was given do not, "
-            f"most of all {worst.name} ({worst.amount.replace('+', '± ')}, {word}): "
-            "give its accuracy in the rig file if it is known better, or calibrate it "
-            "again"
+            f"errors of what was given leave it so, most of all {worst.name} "
+            f"({worst.amount.replace('+', '± ')}, {word}): give its accuracy in the "
+            "rig file if it is known better, or calibrate it again"
         )
 
 
@@ -211,6 +210,7 @@ def _distances(
         if word == "determined":
             continue
         what = _direction(vector, [names[int(c)] for c in free])
+        verb = "are" if what.startswith("the distances") else "is"
         camera = int(free[int(np.argmax(np.abs(vector)))])
         own = _verdict(
             covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * typical, typical
@@ -219,12 +219,12 @@ def _distances(
         known = f"{1e3 * stddev:.1f} {unit}"
         if cause is not None:
             sentences.append(
-                f"{what} is {word}: standard deviation {known} in all; {cause}"
+                f"{what} {verb} {word}: standard deviation {known} in all; {cause}"
             )
             continue
         reason, advice = geometry.reason()
         sentences.append(
-            f"{what} is {word} by {reason}: standard deviation {known}; {advice}"
+            f"{what} {verb} {word} by {reason}: standard deviation {known}; {advice}"
         )
     return sentences
 

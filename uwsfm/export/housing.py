@@ -1,6 +1,9 @@
 """housing.yaml: the refined rig, in the format of the rig file."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.observability import center_verdict, distance_verdict
@@ -28,6 +31,7 @@ def export_housing(
             camera.name: _comments(rig, calibration, index)
             for index, camera in enumerate(rig.cameras)
         }
+        rig = _with_accuracy(rig, calibration)
     dump_rig(
         rig,
         path,
@@ -36,6 +40,30 @@ def export_housing(
         arbitrary_scale=arbitrary,
         estimated=calibration is not None,
     )
+
+
+def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
+    """The rig with what is known of its estimates, for whoever holds them next."""
+    known = calibration.covariance.judged_cameras
+    turned = calibration.options.refine_cam_from_rig
+    cameras = []
+    for c, (camera, cov) in enumerate(zip(rig.cameras, known, strict=True)):
+        found: dict[str, Any] = {}
+        if camera.refine_normal:
+            found["normal_deg"] = cov.normal_stddev_deg
+        if camera.refine_distance and not cov.distance_at_zero:
+            found["distance_m"] = cov.distance_stddev_m
+        if camera.refine_center:
+            found["center_m"] = math.hypot(*cov.center_stddev_m) / math.sqrt(3.0)
+        if c > 0 and turned:
+            found["rotation_deg"] = cov.rotation_stddev_deg / math.sqrt(3.0)
+        digits: dict[str, Any] = {
+            key: float(f"{value:.4g}")
+            for key, value in found.items()
+            if math.isfinite(value)
+        }
+        cameras.append(replace(camera, accuracy=replace(camera.accuracy, **digits)))
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
