@@ -128,8 +128,17 @@ def _to_rig(file: RigFile, folder: Path) -> Rig:
         refine_cam_from_rig=file.refine_cam_from_rig,
         accuracy=accuracy,
     )
-    rig.given_accuracy()  # refuses what this rig does not have
+    _check_accuracy(rig)
     return rig
+
+
+def _check_accuracy(rig: Rig) -> None:
+    """Refuse the accuracy of what this rig does not have."""
+    from uwsfm.models.lens import SUPPORTED_MODELS  # compiles kernels: not for init
+
+    models = {camera.camera.model_name for camera in rig.cameras}
+    if models <= set(SUPPORTED_MODELS):  # others are refused where they are used
+        rig.given_accuracy()
 
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:

@@ -59,13 +59,16 @@ def camera_as_given(
         camera: with the given lens and port.
         translation: (3,) of cam_from_rig; zeros if only its length is known.
         accuracy: None: all of it is assumed.
+
+    Raises:
+        InputError: its lens model can only be unprojected.
     """
-    port, lens = camera.port, camera.camera
-    slots = param_slots(lens.model_name)
+    port, lens = camera.port, camera.lens  # which refuses other models
+    slots = param_slots(camera.camera.model_name)
     kind = "dome" if isinstance(port, DomePort) else "flat"
     return GivenCamera(
         name=name,
-        lens=camera.lens,
+        lens=lens,
         param_names=_param_names(slots),
         slots=slots,
         size_px=(camera.width, camera.height),

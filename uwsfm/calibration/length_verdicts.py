@@ -57,10 +57,11 @@ def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     if stddev is not None and len(result.scene.cameras) == 1 and not given:
         sentences.append(
             "the scale comes from refraction alone, with the port taken as given: if "
-            "the port's distance from the lens is 1 % wrong, all lengths are, about, and "
-            "a tilt of a degree or two that was not given can make them several per cent "
-            "longer; the standard deviation in all holds what the rig file says of the "
-            f"port's accuracy, or what is assumed; {ASK_FOR_LENGTH} to do without it"
+            "its distance from the lens is 1 % wrong, all lengths are, about, and a "
+            "tilt of a degree or two that was not given can make them several per "
+            "cent longer; the standard deviation in all holds what the rig file says "
+            f"of the port's accuracy, or what is assumed; {ASK_FOR_LENGTH} to do "
+            "without it"
         )
     if result.lengths is not None:
         sentences += _contradicted(result.lengths)
