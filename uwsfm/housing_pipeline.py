@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.error_budget import BudgetRow, error_budget
+from uwsfm.calibration.error_budget import BudgetRow, with_budget
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.errors import InputError
@@ -170,7 +170,7 @@ class _Job:
     def run(self, model: ModelStart | None) -> HousingResult:
         compiled(self.front_end.threads, self.progress)
         if self.start == "pairs":
-            calibration = self._from_pairs()
+            calibration, budget = with_budget(self._from_pairs())
             count = calibration.scene.num_frames
             seen = len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
             used = Used(num_frames=count, num_registered=seen)
@@ -186,11 +186,12 @@ class _Job:
             scene, lengths = self.known.placed(self.rig, names, scene)
             options = {"lengths": lengths, **self.options}
             refined = refine_scene(scene, self.rig, self.progress, **options)
-            calibration = refined.calibration
+            calibration, budget = with_budget(refined.calibration)
+            refined = replace(refined, calibration=calibration)
             self.progress("judging the fit", 0, None)
             verdict = refined_verdict(self.rig, refined, num_frames)
         notes = () if model is None else model.warnings
-        return self._finish(calibration, verdict, notes)
+        return self._finish(calibration, budget, verdict, notes)
 
     def _from_images(self) -> tuple[Scene, Sequence[str], int]:
         """The start, the names of its frames, and how many frames there were."""
@@ -223,11 +224,14 @@ class _Job:
         ]
 
     def _finish(
-        self, calibration: CalibrationResult, verdict: Verdict, notes: Sequence[str]
+        self,
+        calibration: CalibrationResult,
+        budget: tuple[BudgetRow, ...],
+        verdict: Verdict,
+        notes: Sequence[str],
     ) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
         rig = refined_rig(self.rig, scene)
-        budget = error_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,
@@ -238,7 +242,7 @@ class _Job:
             "warnings": [
                 *self._notes(),
                 *notes,
-                *housing_warnings(rig, calibration),
+                *housing_warnings(rig, calibration, budget),
             ],
             "error_budget": budget_summary(budget),
             "versions": versions(),

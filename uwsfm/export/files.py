@@ -42,9 +42,7 @@ def read_model(folder: str | Path) -> Model:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     reconstruction = read_reconstruction(folder / SPARSE)
-    return from_reconstruction(
-        reconstruction, load_rig(folder / HOUSING, of_result=True)
-    )
+    return from_reconstruction(reconstruction, load_rig(folder / HOUSING))
 
 
 def read_summary(folder: str | Path) -> dict[str, Any] | None:

@@ -72,7 +72,10 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
         return None
     scene, _ = calibration.scene.select(calibration.inliers)
     how: dict[str, Any] = {f.name: getattr(options, f.name) for f in fields(options)}
-    how["loss"] = "l2"
+    how |= {
+        "loss": "l2",
+        "given": None,
+    }  # what is known of the lenses must not hold them
     size = max(max(camera.width, camera.height) for camera in scene.cameras)
     more = {**FREEDOM, "principal_point_stddev_px": CENTER_SHARE * size}
     try:

@@ -3,7 +3,7 @@ calibration.
 
 What is given has an accuracy. Where the user states none, one of those below is
 assumed; they are wide, as most numbers of a rig file are guesses. The deviation of the
-estimate is added: what the images hardly determine contradicts nothing.
+estimate, in all, is added: what is hardly determined contradicts nothing.
 """
 
 import math
@@ -81,7 +81,7 @@ def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...
     metric = calibration.covariance.scale_stddev is not None
     for index, camera in enumerate(rig.cameras):
         refined = calibration.covariance.border_cols[index] != HELD
-        cov = calibration.covariance.cameras[index]
+        cov = calibration.covariance.judged_cameras[index]
         after = calibration.scene.cameras[index]
         found += _port(camera, after.port, cov, refined, calibration, metric)
         if np.any(refined[border.FIRST_LENS :]):
@@ -98,6 +98,10 @@ def _port(
     metric: bool,
 ) -> list[Departure]:
     before, options, found = camera.port, calibration.options, []
+    # What the rig file says of a number that is refined is no prior, but a claim.
+    distance = options.distance_stddev_m or camera.accuracy.distance_m
+    normal = options.normal_stddev_deg or camera.accuracy.normal_deg
+    stated = options.center_stddev_m or camera.accuracy.center_m
     if isinstance(before, FlatPort) and isinstance(after, FlatPort):
         if metric and (refined[border.DISTANCE] or cov.distance_at_zero):
             smaller = min(before.distance, after.distance)
@@ -109,8 +113,8 @@ def _port(
                     given=before.distance,
                     estimate=after.distance,
                     stddev=0.0 if cov.distance_at_zero else cov.distance_stddev_m,
-                    given_stddev=options.distance_stddev_m or assumed,
-                    stated=options.distance_stddev_m is not None,
+                    given_stddev=distance or assumed,
+                    stated=distance is not None,
                 )
             )
         if np.any(refined[border.NORMAL]):
@@ -122,14 +126,13 @@ def _port(
                     given=0.0,
                     estimate=math.degrees(math.acos(min(max(cosine, -1.0), 1.0))),
                     stddev=cov.normal_stddev_deg,
-                    given_stddev=options.normal_stddev_deg or TILT_DEG,
-                    stated=options.normal_stddev_deg is not None,
+                    given_stddev=normal or TILT_DEG,
+                    stated=normal is not None,
                 )
             )
     if not (isinstance(before, DomePort) and isinstance(after, DomePort)):
         return found
     if np.any(refined[border.CENTER]):
-        stated = options.center_stddev_m
         found.append(
             Departure(
                 camera=camera.name,
