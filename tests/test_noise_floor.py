@@ -48,7 +48,8 @@ def longer(scene):
 
 
 @pytest.mark.parametrize("wrong", [bent, longer])
-def test_a_wrong_model_is_above_the_floor_that_stays_where_it_is(dive, wrong):
+def test_a_wrong_model_is_above_the_floor_that_stays_where_it_is(wrong):
+    dive = simulated_dive(num_points=1500)
     truth = replace(dive.truth, xy=dive.scene.xy)
     found, right = noise_floor(wrong(truth)), noise_floor(truth)
     assert found.ratio > 2.0
@@ -56,8 +57,9 @@ def test_a_wrong_model_is_above_the_floor_that_stays_where_it_is(dive, wrong):
     assert found.floor_px == pytest.approx(right.floor_px, rel=0.15)
 
 
-def test_regions_are_where_the_error_is(dive):
+def test_regions_are_where_the_error_is():
     """A radial term that the given lens lacks shows in the corners."""
+    dive = simulated_dive(num_points=1500)
     truth = replace(dive.truth, xy=dive.scene.xy)
     size = np.array([truth.cameras[0].width, truth.cameras[0].height])
     middle = truth.xy / size - 0.5
