@@ -51,7 +51,7 @@ class Departure:
     given: float
     estimate: float
     stddev: float
-    """Of the estimate; NaN: not determined."""
+    """Of the estimate; NaN: not determined, or held at its bound, zero."""
     given_stddev: float
     """Stated or, where nothing was stated, assumed; NaN: none is needed."""
     stated: bool = False
@@ -112,7 +112,7 @@ def _port(
                     what="distance_m",
                     given=before.distance,
                     estimate=after.distance,
-                    stddev=0.0 if cov.distance_at_zero else cov.distance_stddev_m,
+                    stddev=math.nan if cov.distance_at_zero else cov.distance_stddev_m,
                     given_stddev=distance or assumed,
                     stated=distance is not None,
                 )
