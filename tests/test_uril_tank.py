@@ -47,6 +47,14 @@ def test_pairs_are_registered(study):
     assert result.summary["num_registered_frames"] >= 22
 
 
+def test_the_verdict_is_that_the_lens_as_given_does_not_fit(study):
+    result, _, _ = study
+    assert result.verdict.verdict == "doubtful"
+    named = [r.text for r in result.verdict.reasons if r.code == "lens_does_not_fit"]
+    assert named and all("it is the lens, as given" in text for text in named)
+    assert result.summary["scale"]["verdict"] == "doubtful"
+
+
 def test_error_is_that_of_a_free_pinhole(study):
     """On the same observations: 16 free lens parameters and no rig to obey."""
     result, _, pinhole = study
