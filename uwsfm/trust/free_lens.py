@@ -16,6 +16,7 @@ import numpy as np
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.errors import UwsfmError
+from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
@@ -51,6 +52,9 @@ class FreeLens:
     """Numbers that were free."""
     sigma_px: float
     """Noise of one coordinate that is left then."""
+    evenness: float
+    """Sum of what is saved at the points, over the root of its squares: a wrong lens is
+    seen by all points, an outlier that was kept by a few."""
 
 
 def free_lens(calibration: CalibrationResult) -> FreeLens | None:
@@ -82,11 +86,12 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
         if scene.num_observations > MAX_OBSERVATIONS:
             result = calibrate(_some_frames(scene), **how)
             scene, _ = result.scene.select(result.inliers)
-        after = calibrate(scene, **{**how, **more}).summary
+        result = calibrate(scene, **{**how, **more})
     except UwsfmError:
         return None
-    before = float(np.nansum(scene.residuals() ** 2))
-    saved = max(before - after.num_observations * after.rms_px**2, 0.0)
+    after, of_point = result.summary, _saved(scene, result.scene)
+    saved = max(float(of_point.sum()), 0.0)
+    spread = float(np.linalg.norm(of_point))
     gain = saved / after.sigma_px**2
     count = sum(len(param_slots(c.camera.model_name)) for c in scene.cameras)
     return FreeLens(
@@ -95,6 +100,15 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
         gain=gain,
         num_freed=count,
         sigma_px=after.sigma_px,
+        evenness=saved / spread if spread > 0.0 else 0.0,
+    )
+
+
+def _saved(before: Scene, after: Scene) -> Array:
+    """Squares saved at each point (P,), px^2."""
+    saved = np.sum(before.residuals() ** 2 - after.residuals() ** 2, axis=1)
+    return np.bincount(
+        before.point_idx, np.nan_to_num(saved), minlength=before.num_points
     )
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 from uwsfm._indices import distinct
 from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
 from uwsfm.trust.departed import departed_reasons
+from uwsfm.trust.free_lens import FreeLens
 from uwsfm.trust.goodness import Goodness, Used, goodness_of
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 
@@ -33,6 +34,8 @@ LEVEL = 1e-3
 FREE_LENS_LEVEL = 1e-5
 """The same of free lenses, where errors are taken as independent: of 260 correct dives
 with outliers one had 3e-4; focal lengths 1 % too long have 1e-8 and less."""
+FREE_LENS_EVENNESS = 4.5
+"""Single outliers that were kept make 2.8 to 3.9 of it, wrong lenses 5.8 to 11."""
 NOTICEABLE_PX, NOTICEABLE_SHARE = 0.03, 0.15
 """A significant part below both is no concern: what a detector sees of slanted surfaces
 leaves 0.003 px of rendered and 0.01 px of real images, and a part of a seventh of the
@@ -207,7 +210,7 @@ def _lenses(goodness: Goodness) -> list[Reason]:
     if reasons or free is None:
         return reasons
     severity = _severity(free.px, free.p_value, goodness.sigma_px)
-    if severity is None or free.p_value > FREE_LENS_LEVEL:
+    if severity is None or not _seen_by_all(free):
         return []
     text = (
         f"With the lenses free, {free.px:.2g} px of the residuals vanish "
@@ -227,6 +230,10 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         )
     numbers = {"px": free.px, "p_value": free.p_value, "gain": free.gain}
     return [reason("lenses_do_not_fit", text, severity, **numbers)]
+
+
+def _seen_by_all(free: FreeLens) -> bool:
+    return free.p_value < FREE_LENS_LEVEL and free.evenness > FREE_LENS_EVENNESS
 
 
 def _severity(px: float, p_value: float, sigma_px: float) -> Severity | None:
