@@ -107,9 +107,10 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
 def _saved(before: Scene, after: Scene) -> Array:
     """Squares saved at each point (P,), px^2."""
     saved = np.sum(before.residuals() ** 2 - after.residuals() ** 2, axis=1)
-    return np.bincount(
+    of_point: Array = np.bincount(
         before.point_idx, np.nan_to_num(saved), minlength=before.num_points
     )
+    return of_point
 
 
 def _some_frames(scene: Scene) -> Scene:
