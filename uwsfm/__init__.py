@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
+    from uwsfm.sfm.options import MatchOptions, StartOptions
     from uwsfm.sfm.refractive_colmap import (
         read_refractive_colmap,
         rig_of_refractive_colmap,
@@ -100,6 +101,8 @@ _HOMES = {
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "Result": "uwsfm.result_folder",
     "open_result": "uwsfm.result_folder",
+    "MatchOptions": "uwsfm.sfm.options",
+    "StartOptions": "uwsfm.sfm.options",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
@@ -116,6 +119,7 @@ __all__ = [
     "FlatPort",
     "InputError",
     "Lengths",
+    "MatchOptions",
     "Model",
     "NoPort",
     "Positions",
@@ -123,6 +127,7 @@ __all__ = [
     "Result",
     "Rig",
     "Scene",
+    "StartOptions",
     "Status",
     "UwsfmError",
     "calibrate",

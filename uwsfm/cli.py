@@ -237,6 +237,16 @@ def calibrate(
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     matcher: MatcherOption = "colmap",
+    fundamental_max_error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PIXELS",
+            help="Tolerance of the fundamental matrix of --matcher paper, in raw "
+            "pixels; default: a hundredth of the image's longer side.",
+            show_default=False,
+        ),
+    ] = None,
+    mapper: MapperOption = "pinhole",
     scene_distance: SceneDistanceOption = None,
     seed: SeedOption = 0,
     threads: ThreadsOption = -1,
@@ -248,8 +258,11 @@ def calibrate(
         from uwsfm.housing_pipeline import calibrate_housing
         from uwsfm.sfm.options import MatchOptions, StartOptions
 
+        matching = MatchOptions(
+            matcher=matcher, fundamental_max_error_px=fundamental_max_error
+        )
         front_end = StartOptions(
-            matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+            matching=matching, mapper=mapper, seed=seed, num_threads=threads
         )
         result = calibrate_housing(
             rig,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY, Array
@@ -47,6 +47,14 @@ class RigCamera:
     """Greatest error of ``camera`` as a stand-in for a lens that COLMAP has no model
     of. None: nothing was converted."""
     conversion_rms_px: float | None = None
+
+    def covers(self, xy: Array) -> NDArray[np.bool_]:
+        """Mask (N,) of the pixels (N, 2) that the calibration in air reached."""
+        if self.valid_radius_px is None:
+            return np.ones(len(xy), dtype=bool)
+        center = (self.camera.principal_point_x, self.camera.principal_point_y)
+        radius = np.linalg.norm(np.asarray(xy) - center, axis=1)
+        return radius <= self.valid_radius_px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

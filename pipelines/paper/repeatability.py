@@ -16,7 +16,6 @@ from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import WORK, ReconstructResult
 from uwsfm.rig import Rig
 from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.refine import within_valid_radius
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence, reseeded
@@ -122,9 +121,6 @@ def _stereo_rows(data: str, number: int, rig: Rig, folder: Path) -> list[Row]:
     """Normals alone from matches within the pairs, as in the paper's figure 8."""
     frames = find_frames(folder / "images", rig)
     scene = same_frame_scene(rig, frames, folder / "out" / WORK / "database.db")
-    scene, _ = scene.select(within_valid_radius(scene, rig))
-    # Not yet by their gaps: the ports are guesses. But alone, no ray says anything.
-    scene = without_wrong_matches(scene, max_gaps=np.inf)
     first = uwsfm.calibrate(scene, **HELD)
     # Now that the normals are known, a wrong match shows.
     result = uwsfm.calibrate(without_wrong_matches(first.scene), **HELD)

@@ -51,7 +51,8 @@ def read_same_frame_matches(
 
     Neither the rig's poses nor the distance of a port is used. The essential matrix is
     robustly fitted to the directions of the water rays, in which the lens distortion
-    and nearly all of the refraction are undone.
+    and nearly all of the refraction are undone. Pixels beyond a camera's
+    ``valid_radius_px`` take no part: their rays would be wrong.
 
     Returns:
         One entry per pair of cameras, those without a match included.
@@ -73,6 +74,8 @@ def read_same_frame_matches(
                     continue
                 xy_a = _keypoints(database, id_a)[matches[:, 0]]
                 xy_b = _keypoints(database, id_b)[matches[:, 1]]
+                covered = rig.cameras[a].covers(xy_a) & rig.cameras[b].covers(xy_b)
+                xy_a, xy_b = xy_a[covered], xy_b[covered]
                 good = _epipolar_inliers(cameras[a], cameras[b], xy_a, xy_b)
                 frame = np.full((int(good.sum()), 1), float(f))
                 rows.append(np.hstack([frame, xy_a[good], xy_b[good]]))
