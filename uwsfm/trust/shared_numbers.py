@@ -1,0 +1,207 @@
+"""What two calibrations of one rig found, number by number, and how far apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.reopened import reopened
+from uwsfm.calibration.uncertainty import border_covariance
+from uwsfm.geometry import rigid3, unit_vector
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens import param_slots
+from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.residuals import border
+from uwsfm.scene import IndexArray
+from uwsfm.solver.layout import HELD
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedNumber:
+    """One number of the rig, its ports or lenses, by two calibrations."""
+
+    group: str
+    """Numbers that are judged together: "tilt", "distance", "center", "rotation",
+    "direction", "baseline", "water index" or "lens"."""
+    name: str
+    camera: int
+    unit: str
+    """Empty for what has none."""
+    values: tuple[float, float]
+    stddev: float
+    """Of the difference, as both calibrations predict it from their images."""
+
+    @property
+    def difference(self) -> float:
+        return self.values[1] - self.values[0]
+
+    @property
+    def z(self) -> float:
+        """The difference in its standard deviations."""
+        return self.difference / self.stddev
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SharedNumbers:
+    numbers: tuple[SharedNumber, ...]
+    covariance: Array
+    """(K, K) of the differences, in the units of the numbers."""
+
+    def of(self, group: str) -> IndexArray:
+        """Which numbers are in a group."""
+        mine = [number.group == group for number in self.numbers]
+        return np.flatnonzero(mine)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(number.group for number in self.numbers))
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """Numbers of one slot or a few: both values, and their derivative by the slots."""
+
+    group: str
+    names: Sequence[str]
+    unit: str
+    values: Array
+    """(2, k)"""
+    slots: slice
+    slope: Array
+    """(k, number of slots)"""
+
+
+def shared_numbers(
+    first: CalibrationResult, second: CalibrationResult, names: Sequence[str]
+) -> SharedNumbers:
+    """Compare what both calibrations refined; bounds and what is held are left out.
+
+    Args:
+        first, second: of the same rig, with the same options.
+        names: of the cameras.
+    """
+    both = (first, second)
+    columns = [result.covariance.border_cols for result in both]
+    covariances = [border_covariance(reopened(result)) for result in both]
+    found: list[SharedNumber] = []
+    rows: list[tuple[Array, Array]] = []
+    seen: set[int] = set()
+    for camera, name in enumerate(names):
+        for reading in _readings(both, camera):
+            own = [cols[camera, reading.slots] for cols in columns]
+            if HELD in own[0] or HELD in own[1] or int(own[0][0]) in seen:
+                continue
+            seen.add(int(own[0][0]))  # several ports may share one water
+            spread = [np.zeros((len(reading.names), len(c))) for c in covariances]
+            for row, cols in zip(spread, own, strict=True):
+                row[:, cols] = reading.slope
+            rows.append((spread[0], spread[1]))
+            found += [
+                SharedNumber(
+                    group=reading.group,
+                    name=f"{number} of {name}",
+                    camera=camera,
+                    unit=reading.unit,
+                    values=(float(a), float(b)),
+                    stddev=np.nan,
+                )
+                for number, a, b in zip(reading.names, *reading.values, strict=True)
+            ]
+    total = np.zeros((len(found), len(found)))
+    for side, covariance in enumerate(covariances):
+        if rows:
+            slope = np.concatenate([pair[side] for pair in rows])
+            total += slope @ covariance @ slope.T
+    stddevs = np.sqrt(np.diag(total))
+    return SharedNumbers(
+        numbers=tuple(
+            SharedNumber(**{**vars(number), "stddev": float(stddev)})
+            for number, stddev in zip(found, stddevs, strict=True)
+        ),
+        covariance=total,
+    )
+
+
+def _readings(
+    both: tuple[CalibrationResult, CalibrationResult], camera: int
+) -> Iterator[_Reading]:
+    ports = [result.scene.ports[camera] for result in both]
+    if all(isinstance(port, FlatPort) for port in ports):
+        normals = np.array([port.normal for port in ports])
+        basis = unit_vector.tangent_basis(normals[0])
+        level = np.sqrt(1.0 - normals[0, :2] ** 2)
+        yield _Reading(
+            "tilt",
+            ("tilt x", "tilt y"),
+            "deg",
+            np.degrees(np.arcsin(normals[:, :2])),
+            border.NORMAL,
+            np.degrees(basis[:2] / level[:, None]),
+        )
+        distances = np.array([[1e3 * port.distance] for port in ports])
+        yield _single("distance", "port distance", "mm", distances, border.DISTANCE)
+    if all(isinstance(port, DomePort) for port in ports):
+        yield _Reading(
+            "center",
+            ("centre x", "centre y", "centre z"),
+            "mm",
+            1e3 * np.array([port.center for port in ports]),
+            border.CENTER,
+            1e3 * np.eye(3),
+        )
+    yield from _placement(both, camera)
+    water = np.array([[port.n_water] for port in ports])
+    yield _single("water index", "water index", "", water, border.WATER_INDEX)
+    yield from _lens(both, camera)
+
+
+def _placement(
+    both: tuple[CalibrationResult, CalibrationResult], camera: int
+) -> Iterator[_Reading]:
+    if camera == 0:
+        return
+    poses = np.array([result.scene.cam_from_rig[camera] for result in both])
+    turn = rigid3.compose(poses[1], rigid3.inverse(poses[0]))
+    turned = np.degrees(rigid3.rotvec_from_quat(turn[:4]))
+    yield _Reading(
+        "rotation",
+        ("rotation x", "rotation y", "rotation z"),
+        "deg",
+        np.array([np.zeros(3), turned]),  # against that of the first
+        border.ROTATION,
+        np.degrees(np.eye(3)),
+    )
+    lengths = np.linalg.norm(poses[:, 4:], axis=1)
+    directions = poses[:, 4:] / lengths[:, None]
+    basis = unit_vector.tangent_basis(directions[0])
+    yield _Reading(
+        "direction",
+        ("baseline direction 1", "baseline direction 2"),
+        "deg",
+        np.degrees((directions - directions[0]) @ basis),
+        border.DIRECTION,
+        np.degrees(np.eye(2)),
+    )
+    yield _single("baseline", "baseline", "mm", 1e3 * lengths[:, None], border.LENGTH)
+
+
+def _lens(
+    both: tuple[CalibrationResult, CalibrationResult], camera: int
+) -> Iterator[_Reading]:
+    lenses = [result.scene.cameras[camera].camera for result in both]
+    names = lenses[0].params_info.split(", ")
+    for index, slot in enumerate(param_slots(lenses[0].model_name)):
+        values = np.array([[float(lens.params[index])] for lens in lenses])
+        unit = "px" if slot < 4 else ""
+        place = border.FIRST_LENS + slot
+        yield _single("lens", names[index], unit, values, place)
+
+
+def _single(group: str, name: str, unit: str, values: Array, slot: int) -> _Reading:
+    scale = 1e3 if unit == "mm" else 1.0
+    return _Reading(
+        group, (name,), unit, values, slice(slot, slot + 1), np.array([[scale]])
+    )
