@@ -21,6 +21,7 @@ from uwsfm.export.files import (
     export_colmap,
     export_ply,
 )
+from uwsfm.export.halves_summary import with_halves
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
     errors_summary,
@@ -205,6 +206,7 @@ class _Job:
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, refined.calibration)
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(

@@ -19,6 +19,7 @@ from uwsfm.export.files import (
     SPARSE,
     export_colmap,
 )
+from uwsfm.export.halves_summary import with_halves
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
     errors_summary,
@@ -244,6 +245,7 @@ class _Job:
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, refined.calibration)
         calibration = refined.calibration
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report

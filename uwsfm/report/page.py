@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm.report.gather import Report, plain
+from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
 from uwsfm.report.words import deviation, known_length_rows, position_words
 
@@ -63,6 +64,7 @@ def page_of(report: Report) -> str:
         written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
         systematic=_systematic_words(report),
+        halves=halves_of(summary),
         known_lengths=known_length_rows(summary),
         positions=position_words(summary),
         view_caption=_view_caption(report),
@@ -252,6 +254,7 @@ def _payload(report: Report, scales: Scales) -> dict[str, Any]:
         "residuals": plain(report.residuals),
         "scales": plain(scales),
         "view": _view_payload(report),
+        **halves_payload(report.summary),
     }
 
 

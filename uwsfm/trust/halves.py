@@ -38,8 +38,8 @@ MAX_LENGTHS = 60
 MEDIAN_NORMAL = 0.6745
 """Median of |x| for unit normal x."""
 FARTHEST = 3.0
-"""Times their typical size: differences of lengths beyond, of a point that a wrong match
-has moved, count as this."""
+"""Times their typical size: differences of lengths beyond, of a point that a wrong
+match has moved, count as this."""
 SIGNIFICANT = 0.005
 """The chance of a larger difference, if the predictions are right."""
 
@@ -261,7 +261,7 @@ def _compared_lengths(
     rows = [
         half.point_idx[finite_rows(half.calibration.scene.points)] for half in halves
     ]
-    common = np.intersect1d(*rows)
+    common = np.intersect1d(rows[0], rows[1])
     count = min(MAX_LENGTHS, len(common) // 2)
     if count < 2:
         return None
@@ -289,7 +289,7 @@ def _compared_lengths(
     predicted = None
     if known[0] is not None and known[1] is not None:
         predicted = float(np.hypot(known[0], known[1]))
-    moved = align(*places, np.ones(len(common)), with_scale=True)
+    moved = align(places[0], places[1], np.ones(len(common)), with_scale=True)
     report = Lengths(
         num_pairs=count,
         typical_m=float(np.median(found[0])),

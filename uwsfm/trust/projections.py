@@ -1,10 +1,10 @@
 """By how much two calibrations of one rig project differently, over image and range.
 
-As the cross-validation of mrcal: numbers of a lens, a port and a placement trade against
-each other, and what counts is where they put a pixel. Points on the water rays of the
-first calibration, at the ranges of the scene, are projected by the second one, after the
-one motion of the whole rig that brings both closest together: the frame of a rig is as
-much an estimate as its ports.
+As the cross-validation of mrcal: numbers of a lens, a port and a placement trade
+against each other, and what counts is where they put a pixel. Points on the water rays
+of the first calibration, at the ranges of the scene, are projected by the second one,
+after the one motion of the whole rig that brings both closest together: the frame of a
+rig is as much an estimate as its ports.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
@@ -89,7 +90,7 @@ def _grid(width: int, height: int) -> Array:
     return np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
 
 
-def _observed(scene: Scene, camera: int) -> Array:
+def _observed(scene: Scene, camera: int) -> NDArray[np.bool_]:
     """Mask (ROWS COLUMNS,) of the cells with enough observations."""
     lens = scene.cameras[camera]
     xy = scene.xy[scene.camera_idx == camera]
@@ -99,7 +100,8 @@ def _observed(scene: Scene, camera: int) -> Array:
         [COLUMNS - 1, ROWS - 1],
     )
     counts = np.bincount(cell[:, 1] * COLUMNS + cell[:, 0], minlength=ROWS * COLUMNS)
-    return np.asarray(counts >= LEAST)
+    enough: NDArray[np.bool_] = counts >= LEAST
+    return enough
 
 
 def _ranges(scene: Scene) -> Array:
@@ -111,7 +113,7 @@ def _best_motion(
     scene: Scene,
     in_rig: list[Array],
     places: list[Array],
-    seen: list[Array],
+    seen: list[NDArray[np.bool_]],
     with_scale: bool,
 ) -> Array:
     """(7,) rotation vector, translation and logarithm of the scale of all points that

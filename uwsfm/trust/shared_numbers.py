@@ -18,6 +18,9 @@ from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD
 
+LENS_NAMES = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
+"""As the slots of `uwsfm.residuals.border.LENS`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SharedNumber:
@@ -129,8 +132,10 @@ def _readings(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
     ports = [result.scene.ports[camera] for result in both]
-    if all(isinstance(port, FlatPort) for port in ports):
-        normals = np.array([port.normal for port in ports])
+    flat = [port for port in ports if isinstance(port, FlatPort)]
+    domes = [port for port in ports if isinstance(port, DomePort)]
+    if len(flat) == 2:
+        normals = np.array([port.normal for port in flat])
         basis = unit_vector.tangent_basis(normals[0])
         level = np.sqrt(1.0 - normals[0, :2] ** 2)
         yield _Reading(
@@ -141,14 +146,14 @@ def _readings(
             border.NORMAL,
             np.degrees(basis[:2] / level[:, None]),
         )
-        distances = np.array([[1e3 * port.distance] for port in ports])
+        distances = np.array([[1e3 * port.distance] for port in flat])
         yield _single("distance", "port distance", "mm", distances, border.DISTANCE)
-    if all(isinstance(port, DomePort) for port in ports):
+    if len(domes) == 2:
         yield _Reading(
             "center",
             ("centre x", "centre y", "centre z"),
             "mm",
-            1e3 * np.array([port.center for port in ports]),
+            1e3 * np.array([port.center for port in domes]),
             border.CENTER,
             1e3 * np.eye(3),
         )
@@ -192,12 +197,11 @@ def _lens(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
     lenses = [result.scene.cameras[camera].camera for result in both]
-    names = lenses[0].params_info.split(", ")
     for index, slot in enumerate(param_slots(lenses[0].model_name)):
         values = np.array([[float(lens.params[index])] for lens in lenses])
         unit = "px" if slot < 4 else ""
         place = border.FIRST_LENS + slot
-        yield _single("lens", names[index], unit, values, place)
+        yield _single("lens", LENS_NAMES[slot], unit, values, place)
 
 
 def _single(group: str, name: str, unit: str, values: Array, slot: int) -> _Reading:
