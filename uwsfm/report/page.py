@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from uwsfm.report.gather import Report, plain
 from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.report.tables import budget_columns, budget_lines
 from uwsfm.report.words import deviation, known_length_rows, position_words
 
 _BADGES = {
@@ -66,6 +67,8 @@ def page_of(report: Report) -> str:
         systematic=_systematic_words(report),
         halves=halves_of(summary),
         known_lengths=known_length_rows(summary),
+        budget=budget_lines(summary),
+        budget_columns=budget_columns(summary),
         positions=position_words(summary),
         view_caption=_view_caption(report),
         residual_words=[_residual_words(camera) for camera in report.residuals],
