@@ -119,6 +119,7 @@ def _split_numbers(split: Split) -> dict[str, Any]:
                 "values": list(number.values),
                 "difference": number.difference,
                 "stddev": number.stddev,
+                "stddev_in_all": number.stddev_in_all,
                 "z": number.z,
             }
             for number in split.numbers

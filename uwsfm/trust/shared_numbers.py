@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwsfm.calibration.given_errors import GivenReach, given_reach
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.calibration.reopened import reopened
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
@@ -36,6 +36,9 @@ class SharedNumber:
     values: tuple[float, float]
     stddev: float
     """Of the difference, as both calibrations predict it from their images."""
+    stddev_in_all: float
+    """With the errors of what was given to both alike: what the images of each make of
+    them differs."""
 
     @property
     def difference(self) -> float:
@@ -45,6 +48,10 @@ class SharedNumber:
     def z(self) -> float:
         """The difference in its standard deviations."""
         return self.difference / self.stddev
+
+    @property
+    def z_in_all(self) -> float:
+        return self.difference / self.stddev_in_all
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,21 +94,19 @@ def shared_numbers(
         names: of the cameras.
     """
     both = (first, second)
-    columns = [result.covariance.border_cols for result in both]
-    covariances = [border_covariance(reopened(result)) for result in both]
+    sides = [_Side.of(result) for result in both]
     found: list[SharedNumber] = []
     rows: list[tuple[Array, Array]] = []
+    reaches: list[tuple[Array, Array]] = []
     seen: set[int] = set()
     for camera, name in enumerate(names):
         for reading in _readings(both, camera):
-            own = [cols[camera, reading.slots] for cols in columns]
+            own = [side.columns[camera, reading.slots] for side in sides]
             if HELD in own[0] or HELD in own[1] or int(own[0][0]) in seen:
                 continue
             seen.add(int(own[0][0]))  # several ports may share one water
-            spread = [np.zeros((len(reading.names), len(c))) for c in covariances]
-            for row, cols in zip(spread, own, strict=True):
-                row[:, cols] = reading.slope
-            rows.append((spread[0], spread[1]))
+            rows.append(_both(side.row(camera, reading) for side in sides))
+            reaches.append(_both(side.reached(camera, reading) for side in sides))
             found += [
                 SharedNumber(
                     group=reading.group,
@@ -110,22 +115,79 @@ def shared_numbers(
                     unit=reading.unit,
                     values=(float(a), float(b)),
                     stddev=np.nan,
+                    stddev_in_all=np.nan,
                 )
                 for number, a, b in zip(reading.names, *reading.values, strict=True)
             ]
+    if not found:
+        return SharedNumbers(numbers=(), covariance=np.zeros((0, 0)))
     total = np.zeros((len(found), len(found)))
-    for side, covariance in enumerate(covariances):
-        if rows:
-            slope = np.concatenate([pair[side] for pair in rows])
-            total += slope @ covariance @ slope.T
-    stddevs = np.sqrt(np.diag(total))
+    for k, side in enumerate(sides):
+        slope = np.concatenate([pair[k] for pair in rows])
+        total += slope @ side.covariance @ slope.T
+    reached = [np.concatenate([pair[k] for pair in reaches]) for k in (0, 1)]
+    own = np.diag(total)
+    in_all = np.maximum(own + _given_part(sides, reached), 1e-6 * own)
     return SharedNumbers(
         numbers=tuple(
-            SharedNumber(**{**vars(number), "stddev": float(stddev)})
-            for number, stddev in zip(found, stddevs, strict=True)
+            replace(number, stddev=float(stddev), stddev_in_all=float(wider))
+            for number, stddev, wider in zip(
+                found, np.sqrt(np.diag(total)), np.sqrt(in_all), strict=True
+            )
         ),
         covariance=total,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """What one calibration predicts."""
+
+    columns: IndexArray
+    covariance: Array
+    """(B, B)"""
+    reach: GivenReach
+
+    @classmethod
+    def of(cls, result: CalibrationResult) -> _Side:
+        reach = given_reach(result)
+        covariance = border_covariance(reach.optimum)
+        return cls(result.covariance.border_cols, covariance, reach)
+
+    def row(self, camera: int, reading: _Reading) -> Array:
+        """(k, B) derivative by the refined parameters."""
+        row = np.zeros((len(reading.names), len(self.covariance)))
+        row[:, self.columns[camera, reading.slots]] = reading.slope
+        return row
+
+    def reached(self, camera: int, reading: _Reading) -> Array:
+        """(k, G) derivative by the given numbers."""
+        reached: Array = reading.slope @ self.reach.border_steps[camera, reading.slots]
+        return reached
+
+
+def _both(pair: Iterator[Array]) -> tuple[Array, Array]:
+    first, second = pair
+    return first, second
+
+
+def _given_part(sides: Sequence[_Side], reached: Sequence[Array]) -> Array:
+    """(K,) variance that errors of given numbers, the same in both, add to differences.
+
+    A prior is in what each side predicts already, as if each had one of its own: that
+    part is taken out.
+    """
+    keys = [[tuple(pair) for pair in side.reach.given.tolist()] for side in sides]
+    common = [key for key in keys[0] if key in keys[1]]
+    index = [[own.index(key) for key in common] for own in keys]
+    apart = reached[1][:, index[1]] - reached[0][:, index[0]]
+    covariance = sides[0].reach.covariance[np.ix_(index[0], index[0])]
+    added = np.einsum("kg,gh,kh->k", apart, covariance, apart)
+    for side, steps in zip(sides, reached, strict=True):
+        held = side.reach.num_held
+        own = side.reach.covariance[held:, held:]
+        added -= np.einsum("kg,gh,kh->k", steps[:, held:], own, steps[:, held:])
+    return np.asarray(added)
 
 
 def _readings(
