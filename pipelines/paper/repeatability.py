@@ -50,7 +50,7 @@ def trials(work: Path, tank: Path | None) -> list[Row]:
     rows = paper_rows()
     with ProgressBars() as progress:
         if tank is not None:
-            rig = _tank_rig(tank, work)
+            rig = tank_rig(tank, work)
             rows += _of_sets("tank", tank, rig, NUM_TANK_SETS, work, progress)
         images = work / "rendered_dive"
         if not images.exists():
@@ -61,7 +61,7 @@ def trials(work: Path, tank: Path | None) -> list[Row]:
     return rows
 
 
-def _tank_rig(tank: Path, work: Path) -> Rig:
+def tank_rig(tank: Path, work: Path) -> Rig:
     """The recommended variant of the tank study: covered lens, rig held."""
     sys.path.append(str(Path(__file__).parent.parent / "uril_tank"))
     from tank_rig import write_rig

@@ -2,8 +2,8 @@
 
     python pipelines/trust/z_scores.py DATA -o OUT
 
-DATA is the folder that holds uril_tank/ and coral_tg5/ (see their pipelines). Each is
-reconstructed once, with the choices of its own pipeline. Then its frames are dealt into
+DATA is the folder that holds uril_tank/ and coral_tg5/ (see their pipelines), or one of
+them. Each is reconstructed once, with the choices of its own pipeline. Then its frames are dealt into
 disjoint sets, each set is adjusted alone, and each pair of sets gives, for every tilt,
 distance and lens parameter, a z: their difference over its predicted standard
 deviation. The RMS of z should be 1.
@@ -16,7 +16,6 @@ to their ports, for they see different scenes.
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,9 @@ from typing import Any
 import numpy as np
 
 import uwsfm
-from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.console import ProgressBars
-from uwsfm.scene import IndexArray, Scene
+from uwsfm.scene import IndexArray
+from uwsfm.trust.halves import adjusted_alone
 from uwsfm.trust.shared_numbers import SharedNumber, shared_numbers
 
 PIPELINES = Path(__file__).resolve().parent.parent
@@ -77,28 +76,13 @@ def dealt(num_frames: int, num_sets: int, rng: np.random.Generator | None) -> An
     return [np.sort(order[k::num_sets]) for k in range(num_sets)]
 
 
-def alone(scene: Scene, frames: IndexArray, whole: CalibrationResult) -> Any:
-    """Some frames of a scene, adjusted by themselves."""
-    keep = np.isin(scene.frame_idx, frames)
-    counts = np.bincount(scene.point_idx[keep], minlength=scene.num_points)
-    part, _ = scene.select(keep & (counts[scene.point_idx] >= 2))
-    present, frame_idx = np.unique(part.frame_idx, return_inverse=True)
-    part = replace(
-        part,
-        rig_from_world=scene.rig_from_world[present],
-        frame_idx=frame_idx.astype(np.int64),
-    )
-    options = {f.name: getattr(whole.options, f.name) for f in fields(whole.options)}
-    return uwsfm.calibrate(part, **{**options, "loss": "l2"})
-
-
 def differences(
     result: uwsfm.Result, sets: Sequence[IndexArray]
 ) -> Iterator[SharedNumber]:
     """Of all pairs of sets, what is judged here."""
     names = [camera.name for camera in result.model.rig.cameras]
     whole = result.calibration
-    found = [alone(whole.scene, frames, whole) for frames in sets]
+    found = [adjusted_alone(whole.scene, frames, whole).calibration for frames in sets]
     for first, second in combinations(found, 2):
         for number in shared_numbers(first, second, names).numbers:
             if number.group in GROUPS:
@@ -156,12 +140,16 @@ def main() -> None:
     options = parser.parse_args()
     data, out = options.data.resolve(), options.out
     out.mkdir(parents=True, exist_ok=True)
-    in_tank, of_coral = tank(data, out), coral(data, out)
-    lines = [
-        *table("Tank, 24 pairs: disjoint sixths (4 pairs)", in_tank, 6),
-        *table("Tank: disjoint thirds (8 pairs)", in_tank, 3),
-        *table("Coral, 42 photographs: disjoint thirds (14)", of_coral, 3),
-    ]
+    lines: list[str] = []
+    if (data / "uril_tank").is_dir():
+        in_tank = tank(data, out)
+        lines += table("Tank, 24 pairs: disjoint sixths (4 pairs)", in_tank, 6)
+        lines += table("Tank: disjoint thirds (8 pairs)", in_tank, 3)
+    if (data / "coral_tg5").is_dir():
+        of_coral = coral(data, out)
+        lines += table("Coral, 42 photographs: disjoint thirds (14)", of_coral, 3)
+    if not lines:
+        parser.error(f"{data} holds neither uril_tank/ nor coral_tg5/")
     text = "\n".join(lines)
     (out / "z_scores.md").write_text(text, encoding="utf-8")
     print(text)

@@ -151,7 +151,7 @@ def cross_validate(
     splits, omitted = [], []
     for name, halves in ways.items():
         try:
-            parts = tuple(_adjusted(scene, half, calibration) for half in halves)
+            parts = tuple(adjusted_alone(scene, half, calibration) for half in halves)
             splits.append(_compared(name, rig, scene, parts, seed))
         except UwsfmError as error:
             omitted.append(f"The halves {name} could not be compared: {error}.")
@@ -166,15 +166,28 @@ def cross_validate(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Half:
+class PartOfDive:
+    """Some frames of a result, adjusted by themselves."""
+
     calibration: CalibrationResult
     point_idx: IndexArray
     """(P',) index in the whole of each of its points."""
     num_frames: int
 
 
-def _adjusted(scene: Scene, frames: IndexArray, whole: CalibrationResult) -> _Half:
-    """Some frames alone; their poses and points are numbered anew."""
+def adjusted_alone(
+    scene: Scene, frames: IndexArray, whole: CalibrationResult
+) -> PartOfDive:
+    """Adjust some frames of a result by themselves, from its observations.
+
+    Args:
+        scene: of the result, inliers only.
+        frames: (K,) that are kept; poses and points are numbered anew.
+        whole: its options; lengths from outside take no part.
+
+    Raises:
+        UwsfmError: they are too few, or do not determine what is refined.
+    """
     keep = np.isin(scene.frame_idx, frames)
     counts = np.bincount(scene.point_idx[keep], minlength=scene.num_points)
     keep &= counts[scene.point_idx] >= 2
@@ -196,11 +209,11 @@ def _adjusted(scene: Scene, frames: IndexArray, whole: CalibrationResult) -> _Ha
     result = calibrate(part, **{**options, "loss": "l2"})
     if not result.covariance.determined:
         raise UwsfmError("one of them alone does not determine what is refined")
-    return _Half(calibration=result, point_idx=used, num_frames=len(present))
+    return PartOfDive(calibration=result, point_idx=used, num_frames=len(present))
 
 
 def _compared(
-    name: str, rig: Rig, scene: Scene, halves: Sequence[_Half], seed: int
+    name: str, rig: Rig, scene: Scene, halves: Sequence[PartOfDive], seed: int
 ) -> Split:
     first, second = (half.calibration for half in halves)
     numbers = shared_numbers(first, second, [camera.name for camera in rig.cameras])
@@ -254,7 +267,7 @@ def _judged(group: str, ratio: float, covariance: Array, freedom: int) -> Agreem
 
 
 def _compared_lengths(
-    halves: Sequence[_Half], seed: int
+    halves: Sequence[PartOfDive], seed: int
 ) -> tuple[Lengths, Array, Array] | None:
     """Distances between points of both; differences in their standard deviations (K,),
     and the covariance (K, K) of the differences."""
