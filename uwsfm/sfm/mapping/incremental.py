@@ -20,7 +20,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
-from uwsfm.scene import IndexArray, Scene
+from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.adjustment import (
     Housings,
     adjust_globally,
@@ -39,7 +39,7 @@ from uwsfm.sfm.mapping.initialization import (
     start_tolerance_px,
 )
 from uwsfm.sfm.mapping.registration import Ranking, register_next
-from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
+from uwsfm.sfm.noise_floor import map_floor
 from uwsfm.sfm.options import StartOptions
 
 MIN_FRAMES_FOR_HOUSINGS = 3
@@ -127,7 +127,14 @@ class _Search:
             self.num_tried += 1
             growing = self._grown(group)
             if growing.num_registered > 1:
-                growing.floor = map_floor(growing, self.seed)
+                growing.floor = map_floor(
+                    growing.correspondences,
+                    growing.registered,
+                    growing.cameras,
+                    growing.cam_from_rig,
+                    growing.rig_from_world,
+                    self.seed,
+                )
             best, rival = _better(best, growing)
             if self._in_doubt(best, rival) and num_again < MAX_AGAIN:
                 num_again += 1
@@ -217,24 +224,6 @@ def explained(growing: GrowingMap, max_error_px: float) -> float:
     gaps = np.nan_to_num(growing.gaps_px(np.flatnonzero(inside)), nan=np.inf)
     fit = 1.0 - np.minimum(gaps / max_error_px, 1.0) ** 2
     return float(np.mean(fit)) * min(growing.num_registered / PROBE_FRAMES, 1.0)
-
-
-def map_floor(growing: GrowingMap, seed: int) -> NoiseFloor | None:
-    """What the verified matches between the frames of a map leave, and what their pairs
-    alone would."""
-    of = growing.correspondences
-    inside = growing.registered[of.frame[of.matches]].all(axis=1) & of.verified
-    keypoints = Scene(
-        cameras=growing.cameras,
-        cam_from_rig=growing.cam_from_rig,
-        rig_from_world=growing.rig_from_world,
-        points=np.empty((0, 3)),
-        camera_idx=of.camera,
-        frame_idx=of.frame,
-        point_idx=np.zeros(len(of.xy), dtype=np.int64),
-        xy=of.xy,
-    )
-    return noise_floor(keypoints, of.matches[inside], seed)
 
 
 def _better(
