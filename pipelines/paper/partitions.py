@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import repeatability
-from scipy.stats import f as f_distribution
 from settings import Settings
 from single_pair import HELD
 from tables import Row, Tables, column, markdown, select
@@ -135,7 +134,9 @@ def section(found: Tables) -> str:
                         "median": middle,
                         "range": f"{low:.2f} to {high:.2f}",
                         "paper": paper[camera],
-                        "p": _chance(middle, num_sets, paper[camera]),
+                        "p": repeatability.chance_of_ratio(
+                            middle, num_sets, paper[camera], 3
+                        ),
                     }
                 )
     return TEXT.format(
@@ -173,14 +174,6 @@ def _spreads(rows: Sequence[Row]) -> list[float]:
         float(np.std(column(select(rows, deal=deal), "theta_deg"), ddof=1))
         for deal in deals
     ]
-
-
-def _chance(spread: float, num_sets: int, other: float) -> float:
-    """Of a ratio of the larger to the smaller variance as large, if both are equal."""
-    ratio, freedom = (spread / other) ** 2, (num_sets - 1, 2)
-    if ratio < 1.0:
-        ratio, freedom = 1.0 / ratio, freedom[::-1]
-    return float(f_distribution.sf(ratio, *freedom))
 
 
 def _effects(rows: Sequence[Row]) -> dict[str, float]:

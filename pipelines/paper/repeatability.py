@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import f as f_distribution
 from single_pair import HELD
 from tables import Row, column, select
 
@@ -211,3 +212,12 @@ def _rms_or_none(rows: Sequence[Row], name: str) -> float | None:
     if values[0] is None:
         return None
     return float(np.sqrt(np.nanmean(np.square(np.array(values, dtype=float)))))
+
+
+def chance_of_ratio(first: float, count: int, second: float, other: int) -> float:
+    """Chance of a ratio of two variances as large, the larger one above, if both are
+    equal: of standard deviations of so many numbers."""
+    ratio, freedom = (first / second) ** 2, (count - 1, other - 1)
+    if ratio < 1.0:
+        ratio, freedom = 1.0 / ratio, freedom[::-1]
+    return float(f_distribution.sf(ratio, *freedom))

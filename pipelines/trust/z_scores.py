@@ -3,10 +3,10 @@
     python pipelines/trust/z_scores.py DATA -o OUT
 
 DATA is the folder that holds uril_tank/ and coral_tg5/ (see their pipelines), or one of
-them. Each is reconstructed once, with the choices of its own pipeline. Then its frames are dealt into
-disjoint sets, each set is adjusted alone, and each pair of sets gives, for every tilt,
-distance and lens parameter, a z: their difference over its predicted standard
-deviation. The RMS of z should be 1.
+them. Each is reconstructed once, with the choices of its own pipeline. Then its frames
+are dealt into disjoint sets, each set is adjusted alone, and each pair of sets gives,
+for every tilt, distance and lens parameter, a z: their difference over its predicted
+standard deviation. The RMS of z should be 1.
 
 "Images" predicts from what the images leave over. "In all" adds what errors of given
 numbers do: all sets share the lens as it was calibrated in air, but not what it does
