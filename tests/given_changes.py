@@ -1,6 +1,6 @@
 """A scene as it would have been given with wrong numbers, slot by slot, by hand."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def with_changes(scene, changes):
         lens, port = camera.lens.copy(), camera.port
         lens[:12] += delta[border.LENS]
         for slot, name in FIELDS.items():
-            if hasattr(port, name):
+            if name in {item.name for item in fields(port)}:
                 port = replace(port, **{name: getattr(port, name) + delta[slot]})
         if isinstance(port, FlatPort):
             normal = unit_vector.plus(port.normal, delta[border.NORMAL])

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from given_changes import scaled_accuracy, with_changes
+from test_mixed_ports import dive as mixed_dive
 
 from uwsfm import calibrate, error_budget
 from uwsfm.calibration.error_budget import TOGETHER, with_budget
 from uwsfm.calibration.given_errors import given_reach, in_all
 from uwsfm.calibration.given_items import given_items
+from uwsfm.residuals import border
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -214,3 +216,32 @@ def test_what_is_open_is_nan(optimum):
     rows = {row.name: row for row in error_budget(loose)}
     assert np.isnan(rows["focal length of left"].shifts[0].distance_m)
     assert np.isnan(rows[TOGETHER].scale)
+
+
+def test_domes_and_bare_lenses_have_rows_of_their_own():
+    """Centre held, then free: radius, centre and indices, against solving again."""
+    scene = calibrate(mixed_dive(noise_px=0.1).scene, loss="l2").scene
+    for held in (True, False):
+        how = {"refine_centers": not held, "refine_distances": not held}
+        result = solved(scene, **how)
+        reach = given_reach(result)
+        rows = {row.name: row for row in error_budget(result, reach)}
+        centre = {f"dome centre {axis} of right" for axis in "xyz"}
+        assert (centre <= set(rows)) is held
+        assert "port distance of left" in rows or not held
+        assert not any("glass" in name and "third" in name for name in rows)
+        slot = border.CENTER.start if held else border.RADIUS
+        name = "dome centre x of right" if held else "dome radius of right"
+        changes = np.zeros(reach.accuracy.assumed.shape)
+        changes[1, slot] = reach.accuracy.stddevs[1, slot]
+        again = solved(with_changes(scene, changes), **how).scene
+        left, right, _ = rows[name].shifts
+        turned = np.subtract(again.ports[0].normal, result.scene.ports[0].normal)
+        assert np.linalg.norm(turned - left.normal) < (
+            0.05 * np.linalg.norm(turned) + np.radians(5e-4)
+        )
+        if not held:
+            moved = np.subtract(again.ports[1].center, result.scene.ports[1].center)
+            assert np.linalg.norm(moved) > 1e-6
+            gap = np.linalg.norm(moved - right.center_m)
+            assert gap < 0.05 * np.linalg.norm(moved) + 1e-6

@@ -110,7 +110,7 @@ def correlated(scene):
 
 def test_a_correlated_prior_is_that_of_dense_algebra():
     """Optimum and covariance with lenses refined, against one dense matrix."""
-    scene = small_scene(5, 60, noise_px=0.2).scene
+    scene = small_scene(4, 30, noise_px=0.2).scene
     given = correlated(scene)
     result = calibrate(scene, loss="l2", given=given, **LENS_REFINED)
     optimum = reopened(result)
@@ -152,7 +152,7 @@ def test_a_correlated_prior_and_what_is_held_err_together(rng):
     truth = small_scene(6, 80).truth
     given = correlated(truth)
     scores = []
-    for _ in range(60):
+    for _ in range(30):
         noisy = truth.xy + 0.05 * rng.normal(size=truth.xy.shape)
         wrong = with_changes(replace(truth, xy=noisy), draw(given, rng))
         result = calibrate(wrong, loss="l2", given=given, refine_focal=True)
@@ -166,8 +166,8 @@ def test_a_correlated_prior_and_what_is_held_err_together(rng):
             ]
         )
     ratio = np.sqrt(np.mean(np.square(scores), axis=0))
-    # 60 draws know a standard deviation to 9 %.
-    assert np.all((ratio > 0.75) & (ratio < 1.3)), ratio
+    # 30 draws know a standard deviation to 13 %.
+    assert np.all((ratio > 0.65) & (ratio < 1.4)), ratio
 
 
 def test_a_lens_has_one_prior():

@@ -86,7 +86,7 @@ def test_tables_of_the_console_show_them(summary):
     assert re.search(rf"{own}\s*│\s*{total}", row)
     largest = summary["error_budget"][0]
     assert f"{largest['if']} " in text and f"({largest['deviation']})" in text
-    assert "of every length in all" in text and "azimuth phi" in text
+    assert "of every length in all" in text and "azimuth (deg)" in text
 
 
 def test_the_report_shows_them(dive_result, summary):

@@ -98,8 +98,9 @@ def housing_table(summary: dict[str, Any]) -> Table:
     )
     table.add_column("camera", no_wrap=True)
     table.add_column("port")
-    for column in ("estimate", "± images", "± in all", "verdict"):
+    for column in ("estimate", "± images", "± in all"):
         table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("verdict", justify="right")
     for camera in summary["cameras"]:
         for row in _port_rows(camera, summary["scale"]["small_unit"]):
             table.add_row(Text(camera["name"]), *row)
@@ -142,16 +143,16 @@ def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, ...]]:
 
 
 def _paper_rows(camera: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Azimuth and tilt of the normal, as Sedlazeck and Koch print them."""
+    """Azimuth phi and tilt theta of the normal, as Sedlazeck and Koch print them."""
     return [
         (
-            f"{name} (deg)",
+            f"{key} (deg)",
             f"{camera[f'{key}_deg']:.2f}",
             _number(camera[f"{key}_stddev_deg"], "{:.2f}"),
             _number(camera[f"{key}_stddev_in_all_deg"], "{:.2f}"),
             "",
         )
-        for name, key in (("azimuth phi", "azimuth"), ("tilt theta", "tilt"))
+        for key in ("azimuth", "tilt")
     ]
 
 

@@ -13,7 +13,8 @@ from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
 
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
-Standard deviations are one sigma; normals are unit vectors from camera to water."""
+Standard deviations are one sigma; normals are unit vectors from camera to water.
+"estimated" lets it hold what no person would type; "accuracy" is in all."""
 ARBITRARY = """Scale arbitrary: nothing determined it. Every length below that was
 refined is in the arbitrary unit of the model, not in metres."""
 

@@ -46,7 +46,7 @@ MIN_FRAMES_FOR_HOUSINGS = 3
 END_ERRORS = 6.0
 """Times the median error: the tolerance once the housings are adjusted."""
 MIN_IMAGES = 3
-"""That see a point of the finished map."""
+"""That see a point of the finished map: of a rig, in two frames or more."""
 GROWTH = 1.25
 """Everything is adjusted when there are so many times more frames than last time."""
 RENEWAL = 1.6
@@ -296,6 +296,8 @@ class Grower:
         self.grow(growing.correspondences.num_frames)
         if growing.num_registered > 1:
             growing.retriangulate(self.max_error_px, MIN_IMAGES)
+            if len(growing.cameras) == 1:  # two images are two frames
+                growing.add_pairs(self.max_error_px)
 
     def _place(self, frames: IndexArray, rig_from_world: Array) -> None:
         poses = self.map.rig_from_world.copy()
