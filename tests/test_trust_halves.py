@@ -1,12 +1,18 @@
 """Cross-validation: halves of the frames agree where the model is right, and show by
 how much they differ where it is not."""
 
+import io
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from uwsfm import UwsfmError, calibrate
+from uwsfm.check_halves import check_halves
+from uwsfm.console import halves_table
 from uwsfm.export.halves_summary import KEY, halves_numbers, with_cross_validation
 from uwsfm.export.summary import housing_summary, scale_summary
 from uwsfm.geometry import rigid3
@@ -193,6 +199,28 @@ def test_deviations_in_the_summary_are_enlarged_once(remounted, solved):
     assert again == pytest.approx(own[1])  # not once more
     numbers = halves_numbers(remounted)["splits"][1]["numbers"]
     assert {n["name"] for n in numbers} >= {"port distance of right", "tilt x of left"}
+
+
+def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
+    """As the run itself did it; the table shows what the summary holds."""
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    before = json.loads((out / "summary.json").read_text())
+    bare = {key: value for key, value in before.items() if key != KEY}
+    (out / "summary.json").write_text(json.dumps(bare))
+    numbers = check_halves(out)
+    after = json.loads((out / "summary.json").read_text())
+    assert after[KEY] == json.loads(json.dumps(numbers))
+    for split, first in zip(numbers["splits"], before[KEY]["splits"], strict=True):
+        assert split["num_frames"] == [3, 3]
+        for one, two in zip(split["numbers"], first["numbers"], strict=True):
+            # Read from files of doubles: the same to the solver's last step.
+            assert one["z"] == pytest.approx(two["z"], abs=1e-3)
+    shown = io.StringIO()
+    Console(file=shown, width=150).print(halves_table(numbers))
+    ratio = numbers["splits"][0]["agreements"][0]["ratio"]
+    assert "port tilts" in shown.getvalue() and f"{ratio:.2f} (p" in shown.getvalue()
+    assert numbers["sentences"][0] in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_few_frames_are_refused_with_the_number_that_is_needed():

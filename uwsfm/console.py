@@ -327,6 +327,30 @@ def pinhole_table(report: dict[str, Any]) -> Table:
 _PINHOLE_COLUMNS = ("rms_px", "max_px", "constant_rms_px", "constant_max_px")
 
 
+def halves_table(cross_validation: dict[str, Any]) -> Table:
+    """How far the halves of the frames differ, over what they predict."""
+    from uwsfm.export.halves_summary import NAMES  # heavy
+
+    table = Table(
+        title="Halves of the frames: difference over prediction (1 is right)",
+        title_justify="left",
+    )
+    table.add_column("numbers")
+    splits = cross_validation["splits"]
+    for split in splits:
+        table.add_column(split["name"], justify="right", no_wrap=True)
+    table.add_column("enlarged by", justify="right", no_wrap=True)
+    rows: dict[str, list[str]] = {}
+    for k, split in enumerate(splits):
+        for row in split["agreements"]:
+            cells = rows.setdefault(row["group"], len(splits) * ["-"])
+            cells[k] = f"{row['ratio']:.2f} (p = {row['p_value']:.2g})"
+    for group, cells in rows.items():
+        factor = cross_validation["enlarged"].get(group)
+        table.add_row(NAMES[group], *cells, "" if factor is None else f"{factor:.1f}")
+    return table
+
+
 def batch_table(outcomes: Iterable[Outcome]) -> Table:
     """What became of each dive."""
     table = Table(title="Dives", title_justify="left")

@@ -101,10 +101,10 @@ def shared_numbers(
     seen: set[int] = set()
     for camera, name in enumerate(names):
         for reading in _readings(both, camera):
-            own = [side.columns[camera, reading.slots] for side in sides]
-            if HELD in own[0] or HELD in own[1] or int(own[0][0]) in seen:
+            cols = [side.columns[camera, reading.slots] for side in sides]
+            if HELD in cols[0] or HELD in cols[1] or int(cols[0][0]) in seen:
                 continue
-            seen.add(int(own[0][0]))  # several ports may share one water
+            seen.add(int(cols[0][0]))  # several ports may share one water
             rows.append(_both(side.row(camera, reading) for side in sides))
             reaches.append(_both(side.reached(camera, reading) for side in sides))
             found += [
