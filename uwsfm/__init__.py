@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
+    from uwsfm.check_halves import check_halves
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
     from uwsfm.color.commands import correct_colors
@@ -77,6 +78,7 @@ _HOMES = {
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
     "calibrate_housing": "uwsfm.housing_pipeline",
+    "check_halves": "uwsfm.check_halves",
     "clean_cloud": "uwsfm.surface.commands",
     "correct_colors": "uwsfm.color.commands",
     "error_budget": "uwsfm.calibration.error_budget",
@@ -133,6 +135,7 @@ __all__ = [
     "UwsfmError",
     "calibrate",
     "calibrate_housing",
+    "check_halves",
     "clean_cloud",
     "correct_colors",
     "dense_cloud",
