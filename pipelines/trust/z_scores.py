@@ -16,6 +16,7 @@ to their ports, for they see different scenes.
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 
 import uwsfm
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.console import ProgressBars
 from uwsfm.scene import IndexArray
 from uwsfm.trust.halves import adjusted_alone
@@ -76,12 +78,32 @@ def dealt(num_frames: int, num_sets: int, rng: np.random.Generator | None) -> An
     return [np.sort(order[k::num_sets]) for k in range(num_sets)]
 
 
+LENS_FREE = {
+    "refine_cam_from_rig": True,
+    "refine_focal": True,
+    "refine_principal_point": True,
+    "refine_distortion": True,
+    "focal_stddev": 5e-3,
+    "principal_point_stddev_px": 3.0,
+    "distortion_stddev": 0.02,
+}
+"""About as far as two calibrations of the tank's lenses in air are apart."""
+
+
+def with_own_lens(result: uwsfm.Result) -> CalibrationResult:
+    """Lens and placement refined on all frames, then held as they were before."""
+    whole = result.calibration
+    given = {f.name: getattr(whole.options, f.name) for f in fields(whole.options)}
+    refined = uwsfm.calibrate(whole.scene, **{**given, **LENS_FREE})
+    scene, _ = refined.scene.select(refined.inliers)
+    everything = np.ones(scene.num_observations, dtype=bool)
+    return replace(refined, scene=scene, inliers=everything, options=whole.options)
+
+
 def differences(
-    result: uwsfm.Result, sets: Sequence[IndexArray]
+    whole: CalibrationResult, names: Sequence[str], sets: Sequence[IndexArray]
 ) -> Iterator[SharedNumber]:
     """Of all pairs of sets, what is judged here."""
-    names = [camera.name for camera in result.model.rig.cameras]
-    whole = result.calibration
     found = [adjusted_alone(whole.scene, frames, whole).calibration for frames in sets]
     for first, second in combinations(found, 2):
         for number in shared_numbers(first, second, names).numbers:
@@ -89,9 +111,11 @@ def differences(
                 yield number
 
 
-def table(title: str, result: uwsfm.Result, num_sets: int) -> list[str]:
+def table(
+    title: str, whole: CalibrationResult, names: Sequence[str], num_sets: int
+) -> list[str]:
     """Markdown: RMS of z per number, of interleaved sets and over random deals."""
-    num_frames = result.calibration.scene.num_frames
+    num_frames = whole.scene.num_frames
     rng = np.random.default_rng(0)
     deals = {
         "interleaved": [dealt(num_frames, num_sets, None)],
@@ -102,7 +126,7 @@ def table(title: str, result: uwsfm.Result, num_sets: int) -> list[str]:
     columns: dict[str, dict[str, float]] = {}
     sizes: dict[str, float] = {}
     for name, ways in deals.items():
-        numbers = [n for sets in ways for n in differences(result, sets)]
+        numbers = [n for sets in ways for n in differences(whole, names, sets)]
         for column in ("images", "in all"):
             attribute = "z" if column == "images" else "z_in_all"
             by_name: dict[str, list[float]] = {}
@@ -143,11 +167,17 @@ def main() -> None:
     lines: list[str] = []
     if (data / "uril_tank").is_dir():
         in_tank = tank(data, out)
-        lines += table("Tank, 24 pairs: disjoint sixths (4 pairs)", in_tank, 6)
-        lines += table("Tank: disjoint thirds (8 pairs)", in_tank, 3)
+        sides, found = ("left", "right"), in_tank.calibration
+        lines += table("Tank, 24 pairs: disjoint sixths (4 pairs)", found, sides, 6)
+        lines += table("Tank: disjoint thirds (8 pairs)", found, sides, 3)
+        title = "Tank, lens and placement refined on all pairs, then held: disjoint "
+        found = with_own_lens(in_tank)
+        lines += table(f"{title}sixths", found, sides, 6)
+        lines += table(f"{title}thirds", found, sides, 3)
     if (data / "coral_tg5").is_dir():
-        of_coral = coral(data, out)
-        lines += table("Coral, 42 photographs: disjoint thirds (14)", of_coral, 3)
+        found = coral(data, out).calibration
+        title = "Coral, 42 photographs: disjoint thirds (14)"
+        lines += table(title, found, ("TG-5",), 3)
     if not lines:
         parser.error(f"{data} holds neither uril_tank/ nor coral_tg5/")
     text = "\n".join(lines)
