@@ -80,3 +80,21 @@ def test_what_poses_took_of_shared_errors_is_given_back(rng):
             errors.append(angle / known.normal_stddev_deg)
     # 160 angles, correlated in pairs: known to 6 %.
     assert 0.88 < np.sqrt(np.mean(np.square(errors))) < 1.13
+
+
+def test_a_frame_that_one_quarter_holds_alone_has_finite_deviations():
+    """Its pose hangs on the features of one quarter of one image."""
+    truth = dive(noise_px=0.2).scene
+    last = truth.frame_idx == truth.num_frames - 1
+    corner = (truth.camera_idx == 0) & np.all(truth.xy < [400.0, 300.0], axis=1)
+    part, _ = truth.select(~last | corner)
+    counts = np.bincount(part.point_idx, minlength=part.num_points)
+    part, _ = part.select(counts[part.point_idx] >= 2)
+    assert 6 < np.count_nonzero(part.frame_idx == truth.num_frames - 1) < 100
+    result, whole = calibrate(part, loss="l2"), calibrate(truth, loss="l2")
+    for one, other in zip(
+        result.covariance.cameras, whole.covariance.cameras, strict=True
+    ):
+        # 11 of 12 frames, and more of a chance to be raised.
+        ratio = one.distance_stddev_m / other.distance_stddev_m
+        assert 0.7 < ratio < 1.5

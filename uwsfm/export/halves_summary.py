@@ -45,7 +45,7 @@ def with_halves(
         return dict(summary)
     try:
         found = cross_validate(rig, calibration)
-    except UwsfmError as error:
+    except (UwsfmError, np.linalg.LinAlgError) as error:  # the result is worth more
         return {**summary, KEY: {"omitted": [str(error)]}}
     return with_cross_validation(summary, found)
 
