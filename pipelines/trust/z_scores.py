@@ -14,7 +14,7 @@ to their ports, for they see different scenes.
 """
 
 import argparse
-import sys
+import importlib.util
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
@@ -36,22 +36,29 @@ NUM_DEALS = 16
 GROUPS = ("tilt", "distance", "lens")
 
 
+def loaded(script: str) -> Any:
+    """A module of another pipeline: two of them have the same name."""
+    path = PIPELINES / script
+    spec = importlib.util.spec_from_file_location(
+        f"{path.parent.name}_{path.stem}", path
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def tank(data: Path, out: Path) -> uwsfm.Result:
     """Covered lens, rig held: the recommended variant of pipelines/uril_tank."""
-    sys.path.append(str(PIPELINES / "uril_tank"))
-    from tank_rig import write_rig
-
+    write_rig = loaded("uril_tank/tank_rig.py").write_rig
     write_rig(data / "uril_tank", out / "tank.yaml", whole_image=False, free_rig=False)
     return reconstructed(out / "tank.yaml", data / "uril_tank", out / "tank")
 
 
 def coral(data: Path, out: Path) -> uwsfm.Result:
     """One camera, lens and window refined within what is known of them."""
-    sys.path.append(str(PIPELINES / "coral_tg5"))
-    import pipeline
-
-    write_rig = pipeline.write_rig
-    write_rig(data / "coral_tg5", out / "coral.yaml")
+    pipeline = loaded("coral_tg5/pipeline.py")
+    pipeline.write_rig(data / "coral_tg5", out / "coral.yaml")
     return reconstructed(
         out / "coral.yaml",
         data,
