@@ -58,7 +58,9 @@ def test_the_map_is_in_the_right_basin(features, tmp_path, kind, mapper):
     summary = result.summary
     assert summary["num_registered_frames"] == 22
     # COLMAP has 141k within 4 px; the last adjustment leaves outliers of it out.
-    assert summary["num_observations"] >= 120_000
+    assert summary["num_observations"] >= (
+        120_000 if mapper == "refractive" else 115_000
+    )
     # `uwsfm refine` of stock COLMAP's model has 0.333 px, on stock COLMAP's features.
     assert summary["reprojection_rms_px"]["after"] <= 0.40
     lens = result.model.scene.cameras[0].camera
