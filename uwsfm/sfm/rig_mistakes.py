@@ -35,9 +35,9 @@ class Correction:
     """Which mistake, one of `CODES`."""
     rig: Rig
     what: str
-    """What would then be true: half a sentence that names cameras and numbers."""
+    """The mistake, a clause that names the cameras."""
     remedy: str
-    """What to change in the rig file or the images: a sentence."""
+    """What to change in the rig file or the images: an imperative clause."""
     exchanged: bool = False
     """The images of the first two cameras change places."""
     flipped: int | None = None
@@ -88,7 +88,8 @@ def port_corrections(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="port_none",
             rig=_with_ports(rig, which, lambda _: NoPort()),
-            what=f"`port: none` for {names}: the lens was calibrated in the water",
+            what=f"the lens of {names} was calibrated in the water, though the rig "
+            "file has a port",
             remedy=f"write port: {{type: none}} for {names}, or give the lens as "
             "calibrated in air",
         )
@@ -109,7 +110,7 @@ def missing_ports(rig: Rig) -> Iterator[Correction]:
             rig=_with_ports(rig, which, lambda _: FlatPort(), free=True),
             what=f"the port of {names} is missing in the rig file, where type none is "
             "for a lens that was calibrated in the water, not in air",
-            remedy=f"describe the port of {names}",
+            remedy=f"describe the port of {names} there",
         )
 
 
@@ -120,7 +121,7 @@ def _other_kinds(rig: Rig) -> Iterator[Correction]:
             yield Correction(
                 code="dome_as_flat",
                 rig=_with_ports(rig, which, _as_dome(radius), free=True),
-                what=f"a dome in place of the flat port of {names}",
+                what=f"the port of {names} is a dome, and not flat",
                 remedy=f"describe the port of {names} as type: dome",
             )
     for which in _subsets(rig, lambda c: isinstance(c.port, DomePort)):
@@ -128,7 +129,7 @@ def _other_kinds(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="flat_as_dome",
             rig=_with_ports(rig, which, _as_flat, free=True),
-            what=f"a flat port in place of the dome of {names}",
+            what=f"the port of {names} is flat, and no dome",
             remedy=f"describe the port of {names} as type: flat",
         )
 
@@ -166,7 +167,7 @@ def _other_waters(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="water_index",
             rig=_with_ports(rig, behind, filled),
-            what=f"a refractive index of {index:g} ({medium}) for {given:g}",
+            what=f"the water index is {index:g}, that of {medium}, and not {given:g}",
             remedy=f"write water: {{refractive_index: {index:g}}}",
         )
 
@@ -253,7 +254,7 @@ def _with_distortion(change: Callable[[Array], Array]) -> _Change:
 
 def _undistortions(_: RigCamera) -> Iterator[_Variant]:
     yield (
-        "no distortion for {names}: the images are undistorted already",
+        "the images of {names} are undistorted already",
         "give the images as the camera took them, or a lens without distortion "
         "(model PINHOLE) for {names}",
         _with_distortion(np.zeros_like),
@@ -262,7 +263,7 @@ def _undistortions(_: RigCamera) -> Iterator[_Variant]:
 
 def _signs(_: RigCamera) -> Iterator[_Variant]:
     yield (
-        "the distortion of {names} with its sign changed",
+        "the distortion of {names} has the wrong sign",
         "change the sign of the distortion coefficients of {names}: they must map "
         "from the undistorted to the distorted image",
         _with_distortion(np.negative),
@@ -277,7 +278,7 @@ def _orders(camera: RigCamera) -> Iterator[_Variant]:
     model = camera.camera.model_name
     if model == "FULL_OPENCV":
         yield (
-            "the distortion of {names} read as k1, k2, k3, p1, p2",
+            "the distortion coefficients of {names} are in the order k1, k2, k3, p1, p2",
             remedy,
             _with_distortion(lambda v: v[[0, 1, 3, 4, 2, 5, 6, 7]]),
         )
@@ -290,14 +291,21 @@ def _orders(camera: RigCamera) -> Iterator[_Variant]:
         return with_lens(item, "FULL_OPENCV", np.array(params))
 
     yield (
-        "the distortion of {names} read as k1, k2, k3, p1 (MATLAB, Metashape)",
+        "the distortion coefficients of {names} are in the order k1, k2, k3, p1 "
+        "(MATLAB, Metashape)",
         remedy,
         radial_three,
+    )
+    yield (
+        "the distortion coefficients of {names} are in the order k1, k2, k3, p1 "
+        "(MATLAB, Metashape), and k3 is no part of the lens",
+        remedy,
+        _with_distortion(lambda v: np.array([v[0], v[1], v[3], 0.0])),
     )
     for order in _OPENCV_ORDERS:
         read = sorted(range(4), key=lambda k, order=order: order[k])
         yield (
-            "the distortion of {names} read as "
+            "the distortion coefficients of {names} are in the order "
             f"{', '.join(_OPENCV_NAMES[k] for k in read)}",
             remedy,
             _with_distortion(lambda v, order=order: v[list(order)]),
@@ -314,13 +322,14 @@ def _fisheyes(camera: RigCamera) -> Iterator[_Variant]:
     if not fisheye and camera.camera.model_name not in ("OPENCV", "FULL_OPENCV"):
         return
     other = "OPENCV" if fisheye else "OPENCV_FISHEYE"
+    is_no = "is no fisheye" if fisheye else "is a fisheye"
 
     def exchanged(item: RigCamera) -> RigCamera | None:
         return with_lens(item, other, np.array(item.camera.params[:8]))
 
     yield (
-        f"the lens of {{names}} as {other} with the same numbers",
-        f"write model: {other} for {{names}}",
+        f"the lens of {{names}} {is_no}",
+        f"write model: {other} for {{names}}, with the same numbers",
         exchanged,
     )
 
@@ -340,8 +349,8 @@ def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
         scales.insert(0, centred)
     for scale in scales:
         yield (
-            f"the lens of {{names}} at another resolution: fx, fy, cx and cy times "
-            f"{scale:.3g}",
+            f"the lens of {{names}} was calibrated at another resolution, of images "
+            f"{1.0 / scale:.3g} times as large",
             "give the lens of {names} for the image size that is in the file: multiply "
             f"fx, fy, cx and cy by {scale:.3g}",
             lambda item, scale=scale: scaled_lens(item, scale),
@@ -356,7 +365,7 @@ def _centers(camera: RigCamera) -> Iterator[_Variant]:
         return with_lens(item, item.camera.model_name, params)
 
     yield (
-        "the principal point of {names} in the middle of the image",
+        "the principal point of {names} is in the middle of the image",
         "give the principal point of {names} in pixels of these images: was the lens "
         "calibrated with another crop, size or pixel origin?",
         centred,
@@ -409,7 +418,7 @@ _POSES: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
     ),
     (
         "rotation_transposed",
-        "the rotation of {names} transposed",
+        "the rotation of {names} is transposed",
         "transpose the rotation matrix of {names} (x_in_cam = R x_in_rig + "
         "translation_m; MATLAB's is the transpose)",
         _transposed,

@@ -15,12 +15,17 @@ from typing import Any
 import numpy as np
 
 from uwsfm._progress import Progress, silent
-from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.trust.mistakes import LENS, Trial, trials
-from uwsfm.trust.trials import Fit, adjusted, thinned, trimmed_rms
+from uwsfm.trust.midway import (
+    coarse_firsts,
+    fine_firsts,
+    shifts_since,
+    zoom_trial,
+)
+from uwsfm.trust.mistakes import Trial, length_trials, trials
+from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
 
 UNIT = 0.03
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
@@ -28,8 +33,13 @@ CLEAR = 4.0
 """An explanation must be better than the rig as given by so many."""
 TIE = 1.5
 """Explanations nearer than this to the best cannot be told apart."""
-FREE = 2.0
-"""What a trial that frees numbers must be better by: it always fits better."""
+MAX_TILT_DEG = 15.0
+"""Of a flat port; more is no usual housing."""
+RULER_M, RULER_SHARE = 0.01, 0.5
+"""What a port's distance in a rig file is taken to be known to: a ruler held against a
+housing, to the centre of a lens that nobody sees."""
+AT_ZERO = 1.5
+"""Strain of a port that came out at its lens, which no housing has."""
 MAX_EXPLANATIONS = 3
 
 
@@ -54,10 +64,13 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class _Tried:
+class Tried:
+    """One trial and what came of it."""
+
     trial: Trial
     fit: Fit
     strain: float
+    """How implausible its numbers are, in steps of 3 % of the RMS."""
 
     @property
     def total(self) -> float:
@@ -65,44 +78,86 @@ class _Tried:
 
 
 def diagnose(
-    rig: Rig, scene: Scene, progress: Progress = silent, **options: Any
+    rig: Rig,
+    scene: Scene,
+    frame_names: Sequence[str] | None = None,
+    progress: Progress = silent,
+    **options: Any,
 ) -> tuple[Explanation, ...]:
     """Mistakes that explain the observations, best first; none where the rig fits.
 
     Args:
         rig: As given: lenses, initial ports, placement, and what is to be refined.
-        scene: The result with it, or anything with its observations and poses.
+        scene: The result with it.
+        frame_names: Of the scene's frames (F), for the words; None: their numbers.
         progress: Called with each trial.
         **options: Fields of `CalibrateOptions` that the result was made with.
     """
-    part = thinned(scene)
-    given = Trial(code="", what="", remedy="", rig=rig)
-    base = _base(given, part, options)
-    if base is None:
-        return ()
-    todo = list(trials(rig, part.num_frames))
-    tried = []
-    for done, trial in enumerate(todo):
-        progress("looking for the cause", done, len(todo))
-        one = _try(trial, part, options)
-        if one is not None:
-            tried.append(one)
-    progress("looking for the cause", len(todo), len(todo))
+    part, frames = thinned(scene)
+    names = [frame_names[f] if frame_names else f"{f + 1}" for f in frames.tolist()]
+    experiments = _Experiments(options, progress)
+    base = experiments.given(rig, part)
+    todo = [
+        *trials(rig, part.num_frames),
+        *length_trials(rig, base.fit.distances_m()),
+        *shifts_since(rig, part, base.fit, names),
+    ]
+    tried = experiments.all(todo, part)
+    firsts = coarse_firsts(part.num_frames)
+    zoomed = [zoom_trial(rig, first, names[first]) for first in firsts]
+    coarse = experiments.all(zoomed, part)
+    if coarse:
+        best = min(coarse, key=lambda one: one.total).trial
+        near = fine_firsts(zoomed.index(best), part.num_frames)
+        coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
+    tried += coarse
+    if tried:
+        best_fit = min(tried, key=lambda one: one.total).fit
+        base = experiments.again(base, best_fit, part)
     return explanations(base, tried)
 
 
-def _base(given: Trial, part: Scene, options: dict[str, Any]) -> _Tried | None:
-    """The rig as given: as the result has it, or adjusted anew, whichever fits."""
-    return _try(given, part, options)
+class _Experiments:
+    """Runs trials, and counts them."""
 
+    def __init__(self, options: dict[str, Any], progress: Progress) -> None:
+        self.options = options
+        self.progress = progress
+        self.done = 0
 
-def _try(trial: Trial, part: Scene, options: dict[str, Any]) -> _Tried | None:
-    seen = trial.seen(part)
-    fit = adjusted(seen, trial.rig, **{**options, **trial.options})
-    if fit is None:
-        return None
-    extra = FREE if trial.options else 0.0
-    return _Tried(trial, fit, strain_of(trial.rig, fit) + extra)
+    def tried(self, trial: Trial, part: Scene) -> Tried | None:
+        self.done += 1
+        self.progress("looking for the cause", self.done, None)
+        fit = trial.fit(part, self.options)
+        if fit is None:
+            return None
+        return Tried(trial, fit, strain_of(trial.rig, fit) + trial.handicap)
+
+    def given(self, rig: Rig, part: Scene) -> Tried:
+        """The rig as given: adjusted anew, or as the result has it, what fits better."""
+        trial = Trial(code="", what="", remedy="", rig=rig)
+        placement = part.cam_from_rig if rig.cam_from_rig is None else rig.cam_from_rig
+        fit = fit_of(retriangulated_where_lost(part), placement)
+        result = Tried(trial, fit, strain_of(rig, fit))
+        anew = self.tried(trial, part)
+        return result if anew is None or result.total < anew.total else anew
+
+    def again(self, base: Tried, best: Fit, part: Scene) -> Tried:
+        """The rig as given, from the poses of the best trial: from the ones that it
+        bent it may not have come back."""
+        if best.scene.num_frames != part.num_frames:
+            return base
+        poses = replace(
+            part,
+            rig_from_world=best.scene.rig_from_world,
+            cam_from_rig=best.scene.cam_from_rig,
+        )
+        anew = self.tried(base.trial, poses)
+        return base if anew is None or base.total < anew.total else anew
+
+    def all(self, todo: Iterable[Trial], part: Scene) -> list[Tried]:
+        found = (self.tried(trial, part) for trial in todo)
+        return [one for one in found if one is not None]
 
 
 def strain_of(rig: Rig, fit: Fit) -> float:
@@ -110,28 +165,32 @@ def strain_of(rig: Rig, fit: Fit) -> float:
     total = 0.0
     for item, port in zip(rig.cameras, fit.scene.ports, strict=True):
         if isinstance(port, FlatPort) and isinstance(item.port, FlatPort):
-            total += _beyond(_ratio(port.distance, item.port.distance), 1.1, 0.4)
-            total += _beyond(float(np.degrees(np.arccos(port.normal[2]))), 15.0, 5.0)
+            if item.refine_distance:
+                total += _distance_strain(port.distance, item.port.distance)
+            tilt = float(np.degrees(np.arccos(min(port.normal[2], 1.0))))
+            total += _beyond(tilt, MAX_TILT_DEG, 5.0)
         if isinstance(port, DomePort):
             offset = float(np.linalg.norm(port.center)) / port.radius
             total += _beyond(offset, 0.3, 0.1)
-    return total + _beyond(fit.turn_deg, 0.5, 0.5)
+    return total + _beyond(fit.turn_deg, 0.5, 0.5) + _beyond(fit.swing_deg, 1.0, 1.0)
 
 
-def _ratio(distance: float, given: float) -> float:
-    """Of a port's distance and the ruler's, as a logarithm; 3 mm are nothing."""
-    return abs(math.log((distance + 0.003) / (given + 0.003)))
+def _distance_strain(distance: float, given: float) -> float:
+    """Of a port's distance against the ruler's."""
+    ruler = math.hypot(RULER_M, RULER_SHARE * min(distance, given))
+    at_zero = AT_ZERO if distance < 5e-4 < given else 0.0
+    return _beyond(abs(distance - given) / ruler, 2.0, 1.0) + at_zero
 
 
 def _beyond(value: float, usual: float, step: float) -> float:
     return min(max(value - usual, 0.0) / step, 8.0)
 
 
-def explanations(base: _Tried, tried: Iterable[_Tried]) -> tuple[Explanation, ...]:
+def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]:
     """Those that are clearly better, best first: one of each kind."""
     better = [one for one in tried if base.total - one.total >= CLEAR]
     better.sort(key=lambda one: one.total)
-    chosen: list[_Tried] = []
+    chosen: list[Tried] = []
     for one in better:
         if one.total - better[0].total > TIE:
             break
@@ -140,13 +199,45 @@ def explanations(base: _Tried, tried: Iterable[_Tried]) -> tuple[Explanation, ..
     return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
 
 
-def _explained(base: _Tried, one: _Tried) -> Explanation:
+def _explained(base: Tried, one: Tried) -> Explanation:
     before, after = base.fit.rms_px, one.fit.rms_px
+    evidence = [f"{before:.2f} px becomes {after:.2f}"]
+    if before < after * (1.0 + UNIT):
+        evidence = [f"the RMS stays at {after:.2f} px"]
+    evidence += [*_port_evidence(base, one), *_turn_evidence(base, one)]
+    told, remedy = one.trial.estimate(one.fit), one.trial.remedy
     return Explanation(
         code=one.trial.code,
-        text=f"With {one.trial.what}, {before:.2f} px becomes {after:.2f}. "
-        f"Remedy: {one.trial.remedy}.",
+        text=f"Probably {one.trial.what}{told}. Without this mistake "
+        f"{', '.join(evidence)}. {remedy[0].upper()}{remedy[1:]}.",
         rms_before_px=before,
         rms_after_px=after,
         gain=base.total - one.total,
     )
+
+
+def _port_evidence(base: Tried, one: Tried) -> list[str]:
+    before, after = base.fit.distances_m(), one.fit.distances_m()
+    given = [
+        item.port.distance
+        for item in one.trial.rig.cameras
+        if isinstance(item.port, FlatPort)
+    ]
+    if not before or base.strain < 1.0:
+        return []
+    text = f"ports at {_millimetres(before)}"
+    if after:
+        text += f" become {_millimetres(after)} (rig file: {_millimetres(given)})"
+        return [text]
+    return [f"{text} are no more needed"]
+
+
+def _turn_evidence(base: Tried, one: Tried) -> list[str]:
+    before, after = base.fit.turn_deg, one.fit.turn_deg
+    if before < 0.5 or after > 0.5 * before:
+        return []
+    return [f"and cam_from_rig turns by {after:.1f} degrees in place of {before:.1f}"]
+
+
+def _millimetres(values: Sequence[float]) -> str:
+    return " and ".join(f"{1e3 * value:.0f}" for value in values) + " mm"

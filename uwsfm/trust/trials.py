@@ -22,7 +22,7 @@ from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig
-from uwsfm.scene import Scene
+from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.refine import retriangulated, rig_options
 
 TRIMMED = 0.9
@@ -48,6 +48,10 @@ class Fit:
     """(N,) squared errors, px^2; `UNEXPLAINED_PX` squared where there is none."""
     turn_deg: float
     """The largest turn of a camera from the placement of the trial's rig."""
+    swing_deg: float
+    """The largest turn of a baseline from there."""
+    focals: tuple[Array, Array] | None = None
+    """(C,) each, px: before and after a change of zoom."""
 
     @property
     def rms_px(self) -> float:
@@ -83,7 +87,7 @@ def adjusted(scene: Scene, rig: Rig, **options: Any) -> Fit | None:
     """
     placement = scene.cam_from_rig if rig.cam_from_rig is None else rig.cam_from_rig
     start = replace(
-        scene,
+        _at_length(scene, placement),
         cameras=rig.refractive_cameras(),
         cam_from_rig=placement,
         points=np.full_like(scene.points, np.nan),
@@ -102,15 +106,34 @@ def adjusted(scene: Scene, rig: Rig, **options: Any) -> Fit | None:
             start = _solved(retriangulated(start, everything), settings)
     except (UwsfmError, np.linalg.LinAlgError):
         return None
-    final = retriangulated_where_lost(start)
-    squares = np.sum(final.residuals() ** 2, axis=1)
+    return fit_of(retriangulated_where_lost(start), placement)
+
+
+def fit_of(scene: Scene, placement: Array) -> Fit:
+    """How well a scene fits its observations, and a placement (C, 7) its own."""
+    squares = np.sum(scene.residuals() ** 2, axis=1)
     squares = np.where(np.isfinite(squares), squares, UNEXPLAINED_PX**2)
-    turns = rigid3.compose(final.cam_from_rig, rigid3.inverse(placement))
+    turns = rigid3.compose(scene.cam_from_rig, rigid3.inverse(placement))
+    a, b = (rigid3.inverse(poses)[1:, 4:] for poses in (scene.cam_from_rig, placement))
+    swing = np.arctan2(
+        np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ci,ci->c", a, b)
+    )
     return Fit(
-        scene=final,
+        scene=scene,
         squares=np.minimum(squares, UNEXPLAINED_PX**2),
         turn_deg=float(np.degrees(rigid3.rotation_angle(turns)).max()),
+        swing_deg=float(np.degrees(swing).max(initial=0.0)),
     )
+
+
+def _at_length(scene: Scene, placement: Array) -> Scene:
+    """The scene with its frames as far apart as a baseline of another length has it."""
+    if len(placement) < 2:
+        return scene
+    lengths = [float(np.linalg.norm(p[1, 4:])) for p in (placement, scene.cam_from_rig)]
+    poses = scene.rig_from_world.copy()
+    poses[:, 4:] *= lengths[0] / lengths[1]
+    return replace(scene, rig_from_world=poses)
 
 
 def retriangulated_where_lost(scene: Scene) -> Scene:
@@ -138,7 +161,7 @@ def _solved(scene: Scene, settings: CalibrateOptions) -> Scene:
     )
     run = Run(part, part, settings, Outside(part, Lengths()), None)
     every = np.ones(part.num_observations, dtype=bool)
-    solved = run.solve(State_of(run, part), every, "cauchy")
+    solved = run.solve(run.outside.start(part), every, "cauchy")
     result = solved.state.to_scene(part)
     points = np.full_like(scene.points, np.nan)
     points[used] = result.points
@@ -151,10 +174,6 @@ def _solved(scene: Scene, settings: CalibrateOptions) -> Scene:
     )
 
 
-def State_of(run: Run, part: Scene):
-    return run.outside.start(part)
-
-
 def _usable(scene: Scene) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(scene.residuals(), axis=1) <= MAX_START_PX
@@ -162,10 +181,11 @@ def _usable(scene: Scene) -> NDArray[np.bool_]:
     return near & (counts[scene.point_idx] >= 2)
 
 
-def thinned(scene: Scene, seed: int = 0) -> Scene:
-    """A part of a scene that shows as much of the rig: neighbouring frames, some points.
+def thinned(scene: Scene, seed: int = 0) -> tuple[Scene, IndexArray]:
+    """A part of a scene that shows as much: neighbouring frames, points seen often.
 
-    Points that several cameras see in one frame come first: they tie the rig.
+    Returns:
+        The part, and which frames it has.
     """
     used = np.unique(scene.frame_idx)
     if len(used) > MAX_FRAMES:
@@ -179,8 +199,9 @@ def thinned(scene: Scene, seed: int = 0) -> Scene:
     chosen = chosen[counts[chosen] >= 2]
     smaller, _ = scene.select(inside & np.isin(scene.point_idx, chosen))
     frames, frame_idx = np.unique(smaller.frame_idx, return_inverse=True)
-    return replace(
+    part = replace(
         smaller,
         rig_from_world=smaller.rig_from_world[frames],
         frame_idx=frame_idx.astype(np.int64),
     )
+    return part, frames
