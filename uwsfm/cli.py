@@ -21,6 +21,7 @@ from uwsfm.cli_options import (
     LeverArmOption,
     MapperOption,
     MatcherOption,
+    MaxFeaturesOption,
     PositionsOption,
     PriorOption,
     RefineOption,
@@ -131,6 +132,7 @@ def reconstruct(
     clahe: Annotated[
         bool, typer.Option(help="Raise the local contrast first: for turbid water.")
     ] = False,
+    max_features: MaxFeaturesOption = None,
     masks: Annotated[
         Path | None,
         typer.Option(help="Folder of masks, IMAGE.png beside each image path."),
@@ -178,6 +180,7 @@ def reconstruct(
             images,
             out,
             clahe=clahe,
+            max_features=max_features,
             masks=masks,
             matching=matching,
             matcher=matcher,
@@ -237,6 +240,7 @@ def calibrate(
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     matcher: MatcherOption = "colmap",
+    max_features: MaxFeaturesOption = None,
     scene_distance: SceneDistanceOption = None,
     seed: SeedOption = 0,
     threads: ThreadsOption = -1,
@@ -246,10 +250,13 @@ def calibrate(
 
     with ProgressBars() as progress:
         from uwsfm.housing_pipeline import calibrate_housing
-        from uwsfm.sfm.options import MatchOptions, StartOptions
+        from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
         front_end = StartOptions(
-            matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+            features=FeatureOptions(max_num_features=max_features),
+            matching=MatchOptions(matcher=matcher),
+            seed=seed,
+            num_threads=threads,
         )
         result = calibrate_housing(
             rig,

@@ -57,6 +57,7 @@ class OptionsEntry(Entry):
     """As of `uwsfm reconstruct`; None: its default."""
 
     clahe: bool | None = None
+    max_features: Annotated[int, Field(ge=100)] | None = None
     masks: str | None = None
     matching: Literal["auto", "exhaustive", "sequential"] | None = None
     matcher: Literal["colmap", "paper"] | None = None

@@ -77,6 +77,7 @@ def reconstruct(
     out: str | Path,
     *,
     clahe: bool = False,
+    max_features: int | None = None,
     masks: str | Path | None = None,
     matching: Matching = "auto",
     matcher: Matcher = "colmap",
@@ -106,6 +107,7 @@ def reconstruct(
             ``calibration.npz`` and ``summary.json``, each replaced as a whole;
             `uwsfm.open_result` reads it.
         clahe: Equalise contrast locally before the search for features.
+        max_features: Features per image, about; None: by the size of the images.
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
         matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
@@ -136,7 +138,9 @@ def reconstruct(
     out = output_folder(out, images)
     options = StartOptions(
         features=FeatureOptions(
-            clahe=clahe, mask_dir=None if masks is None else Path(masks)
+            clahe=clahe,
+            max_num_features=max_features,
+            mask_dir=None if masks is None else Path(masks),
         ),
         matching=MatchOptions(strategy=matching, matcher=matcher),
         mapping=MappingOptions(submap_frames=submap_frames),

@@ -97,6 +97,15 @@ class NoiseFloor:
         """How many times larger than its floor the model's error is."""
         return self.model_px / max(self.floor_px, MIN_NOISE_PX)
 
+    def summary(self) -> dict[str, float]:
+        """For summary.json."""
+        return {
+            "floor_px": self.floor_px,
+            "model_px": self.model_px,
+            "num_pairs": self.num_pairs,
+            "num_matches": self.num_matches,
+        }
+
 
 def noise_floor(
     scene: Scene, matches: IndexArray | None = None, seed: int = 0
@@ -133,7 +142,8 @@ def _pooled(
         if gaps is None:
             continue
         good = gaps.best <= CUT_STDDEVS * gaps.noise_px
-        share = 1.0 - gaps.freedom / max(np.count_nonzero(good), gaps.freedom + 1)
+        num_good = max(int(np.count_nonzero(good)), gaps.freedom + 1)
+        share = 1.0 - gaps.freedom / num_good
         model.append(np.minimum(gaps.model[good], MAX_GAP_PX))
         floor.append(gaps.best[good] / np.sqrt(share))
         places.append(_cells(scene, rows[good, 0]))
@@ -260,7 +270,7 @@ def _adjusted(pair: Scene, noise_px: float) -> tuple[Array, int] | None:
         )
         priors = border_priors(part, settings, columns, scale)
         state = minimize(layout, state, options, priors).state
-        gaps = gaps_px(state.to_scene(part), _ends(np.count_nonzero(usable)))
+        gaps = gaps_px(state.to_scene(part), _ends(part.num_points))
         scale = max(float(np.median(gaps)) / MEDIAN_GAP, MIN_NOISE_PX)
     best[usable] = np.nan_to_num(gaps, nan=np.inf)
     # Rotation and direction of the motion; its length is open.

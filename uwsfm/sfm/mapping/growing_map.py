@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.observers import Chains, errors_px
 from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
 from uwsfm.sfm.mapping.triangulation import Views
+from uwsfm.sfm.noise_floor import NoiseFloor
 
 Mask = NDArray[np.bool_]
 
@@ -54,6 +56,10 @@ class GrowingMap:
         self.chains = Chains.empty(num_keypoints)
         self.changes = np.zeros(num_frames, dtype=np.int64)
         """(F,) counts how often what a frame may see has changed."""
+        self.floor: NoiseFloor | None = None
+        """Of the finished map; None if too few matches tell."""
+        self.num_starts = 1
+        """Beginnings that were tried until this one was taken."""
         self._poses = np.zeros((num_frames * correspondences.num_cameras, 12))
         self._world_rays = np.full((2, num_keypoints, 3), np.nan)
         self._camera_rays = np.full((2, num_keypoints, 3), np.nan)
@@ -157,10 +163,12 @@ class GrowingMap:
         seen = np.concatenate([self.point_of[of.keypoints_of(f)] for f in frames])
         return distinct(seen[seen >= 0])
 
-    def counts(self) -> dict[str, float]:
+    def counts(self) -> dict[str, Any]:
         """For the report."""
         scene, _ = self.scene()
         return {
+            "num_starts": self.num_starts,
+            "noise_floor": None if self.floor is None else self.floor.summary(),
             "num_points": scene.num_points,
             "num_observations": scene.num_observations,
             "mean_error_px": float(
