@@ -13,6 +13,7 @@ import typer
 
 from uwsfm import _signals
 from uwsfm.cli_batch import batch
+from uwsfm.cli_check import check
 from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
 from uwsfm.cli_measure import measure
@@ -54,6 +55,7 @@ app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
+app.command()(check)
 app.command()(dense)
 app.command()(measure)
 app.command()(clean)

@@ -256,6 +256,22 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
+def explanations_table(explanations: Iterable[dict[str, Any]]) -> Table:
+    """Mistakes that explain the images, each with its evidence."""
+    table = Table(
+        title="RMS of the best 90 % of the observations (px)", title_justify="left"
+    )
+    table.add_column("mistake", no_wrap=True)
+    table.add_column("as given", justify="right", no_wrap=True)
+    table.add_column("without it", justify="right", no_wrap=True)
+    table.add_column("evidence and remedy")
+    for one in explanations:
+        before, after = one["rms_before_px"], one["rms_after_px"]
+        code = one["code"].replace("_", " ")
+        table.add_row(code, f"{before:.2f}", f"{after:.2f}", Text(one["text"]))
+    return table
+
+
 MAX_IMAGE_ROWS = 40
 
 

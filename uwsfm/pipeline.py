@@ -17,11 +17,12 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
     export_ply,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     errors_summary,
     housing_summary,
@@ -200,6 +201,7 @@ class _Job:
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
         export_housing(model.rig, out / HOUSING, refined.calibration)
+        export_given_rig(self.rig, out / RIG_GIVEN)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock

@@ -16,10 +16,11 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     errors_summary,
     housing_summary,
@@ -239,6 +240,7 @@ class _Job:
         model, refined = self._model(refined, tracks)
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, refined.calibration)
+        export_given_rig(self.rig, self.out / RIG_GIVEN)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock

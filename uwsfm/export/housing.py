@@ -9,6 +9,7 @@ from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
 
+GIVEN = """The rig as given for this result, before anything was refined."""
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
 Standard deviations are one sigma; normals are unit vectors from camera to water."""
 ARBITRARY = """Scale arbitrary: nothing determined it. Every length below that was
@@ -29,6 +30,11 @@ def export_housing(
             for index, camera in enumerate(rig.cameras)
         }
     dump_rig(rig, path, header, comments, arbitrary_scale=arbitrary)
+
+
+def export_given_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig as it was given, for `uwsfm check` to find the mistake in it."""
+    dump_rig(rig, path, GIVEN, {})
 
 
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:

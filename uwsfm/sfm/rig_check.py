@@ -256,9 +256,7 @@ def _corrected(correction: Correction, pair: PairMatches) -> PairMatches:
     )
     if a[0] > b[0]:
         a, xy_a, b, xy_b = b, xy_b, a, xy_a
-    return replace(
-        pair, camera_a=int(a[0]), camera_b=int(b[0]), xy_a=xy_a, xy_b=xy_b
-    )
+    return replace(pair, camera_a=int(a[0]), camera_b=int(b[0]), xy_a=xy_a, xy_b=xy_b)
 
 
 def _shift_ideas(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.rig_file import FRESH_WATER
+from uwsfm.scene import IndexArray
 
 DOME_RADII_M = (0.05, 0.1)
 """Of domes on the market, about; any radius undoes the most of a wrong flat port."""
@@ -261,13 +263,30 @@ def _undistortions(_: RigCamera) -> Iterator[_Variant]:
     )
 
 
-def _signs(_: RigCamera) -> Iterator[_Variant]:
-    yield (
-        "the distortion of {names} has the wrong sign",
-        "change the sign of the distortion coefficients of {names}: they must map "
-        "from the undistorted to the distorted image",
-        _with_distortion(np.negative),
+def _signs(camera: RigCamera) -> Iterator[_Variant]:
+    what = "the distortion of {names} has the wrong sign"
+    remedy = (
+        "change the sign of the distortion coefficients of {names}: they must map from "
+        "the undistorted to the distorted image"
     )
+    yield what, remedy, _with_distortion(np.negative)
+    if camera.camera.model_name == "OPENCV":
+        yield (
+            f"{what}: that of k1 and k2 alone",
+            remedy,
+            _with_distortion(lambda v: v * [-1.0, -1.0, 1.0, 1.0]),
+        )
+        yield (
+            f"{what}: they undistort",
+            "give the coefficients of {names} that distort, not those that undistort",
+            _with_distortion(_inverse_polynomial),
+        )
+
+
+def _inverse_polynomial(undistortion: Array) -> Array:
+    """OPENCV's coefficients that undo others, to fifth order in the radius."""
+    k1, k2, p1, p2 = undistortion
+    return np.array([-k1, 3.0 * k1**2 - k2, -p1, -p2])
 
 
 def _orders(camera: RigCamera) -> Iterator[_Variant]:
@@ -278,9 +297,10 @@ def _orders(camera: RigCamera) -> Iterator[_Variant]:
     model = camera.camera.model_name
     if model == "FULL_OPENCV":
         yield (
-            "the distortion coefficients of {names} are in the order k1, k2, k3, p1, p2",
+            "the distortion coefficients of {names} are in the order "
+            "k1, k2, k3, p1, p2",
             remedy,
-            _with_distortion(lambda v: v[[0, 1, 3, 4, 2, 5, 6, 7]]),
+            _with_distortion(_in_order((0, 1, 3, 4, 2, 5, 6, 7))),
         )
     if model != "OPENCV":
         return
@@ -303,13 +323,17 @@ def _orders(camera: RigCamera) -> Iterator[_Variant]:
         _with_distortion(lambda v: np.array([v[0], v[1], v[3], 0.0])),
     )
     for order in _OPENCV_ORDERS:
-        read = sorted(range(4), key=lambda k, order=order: order[k])
+        read = np.argsort(order).tolist()
         yield (
             "the distortion coefficients of {names} are in the order "
             f"{', '.join(_OPENCV_NAMES[k] for k in read)}",
             remedy,
-            _with_distortion(lambda v, order=order: v[list(order)]),
+            _with_distortion(_in_order(order)),
         )
+
+
+def _in_order(order: tuple[int, ...]) -> Callable[[Array], Array]:
+    return lambda values: values[list(order)]
 
 
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2")
@@ -353,7 +377,7 @@ def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
             f"{1.0 / scale:.3g} times as large",
             "give the lens of {names} for the image size that is in the file: multiply "
             f"fx, fy, cx and cy by {scale:.3g}",
-            lambda item, scale=scale: scaled_lens(item, scale),
+            partial(scaled_lens, scale=scale),
         )
 
 
@@ -366,8 +390,8 @@ def _centers(camera: RigCamera) -> Iterator[_Variant]:
 
     yield (
         "the principal point of {names} is in the middle of the image",
-        "give the principal point of {names} in pixels of these images: was the lens "
-        "calibrated with another crop, size or pixel origin?",
+        "give cx and cy of {names} in pixels of these images: crop, image size and "
+        "pixel origin must be those of the calibration",
         centred,
     )
 
@@ -472,8 +496,8 @@ def shift_words(name: str, shift: int, since: str = "") -> tuple[str, str]:
 
 
 def corrected_pixels(
-    correction: Correction, sizes: Array, camera_idx: Array, xy: Array
-) -> tuple[Array, Array]:
+    correction: Correction, sizes: Array, camera_idx: IndexArray, xy: Array
+) -> tuple[IndexArray, Array]:
     """Cameras (N,) and pixels (N, 2) of observations once the images are put right.
 
     Args:

@@ -73,7 +73,9 @@ def read_same_frame_matches(
         ids = {image.name: image.image_id for image in database.read_all_images()}
         for a, b in combinations(range(len(cameras)), 2):
             rows = []
-            for f in chosen[(chosen >= -shift) & (chosen < num_frames - shift)].tolist():
+            for f in chosen[
+                (chosen >= -shift) & (chosen < num_frames - shift)
+            ].tolist():
                 id_a = ids[frames.image_name(a, f)]
                 id_b = ids[frames.image_name(b, f + shift)]
                 matches = database.read_matches(id_a, id_b)

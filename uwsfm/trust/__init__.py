@@ -1,1 +1,1 @@
-"""Is the result to be trusted: goodness of fit, verdict, diagnosis, cross-validation."""
+"""Is a result to be trusted: goodness of fit, verdict, diagnosis, cross-validation."""

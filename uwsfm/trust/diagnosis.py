@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm._progress import Progress, silent
+from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResult
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
@@ -77,6 +78,26 @@ class Tried:
         return math.log(max(self.fit.rms_px, 1e-9)) / UNIT + self.strain
 
 
+def options_of(calibration: CalibrationResult) -> dict[str, Any]:
+    """What a result was asked to refine and knew, beside its rig file, for `diagnose`.
+
+    Another strategy or error than the joint one on pixels is left out: mistakes show in
+    pixels.
+    """
+    given, plain = asdict(calibration.options), asdict(CalibrateOptions())
+    return {name: given[name] for name in _KEPT if given[name] != plain[name]}
+
+
+_KEPT = (
+    *PRIORS,
+    "refine_focal",
+    "refine_principal_point",
+    "refine_distortion",
+    "refine_water_index",
+    "separate_water_index",
+)
+
+
 def diagnose(
     rig: Rig,
     scene: Scene,
@@ -107,8 +128,8 @@ def diagnose(
     zoomed = [zoom_trial(rig, first, names[first]) for first in firsts]
     coarse = experiments.all(zoomed, part)
     if coarse:
-        best = min(coarse, key=lambda one: one.total).trial
-        near = fine_firsts(zoomed.index(best), part.num_frames)
+        best = min(range(len(coarse)), key=lambda k: coarse[k].total)
+        near = fine_firsts(coarse[best].trial.first, part.num_frames)
         coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
     tried += coarse
     if tried:
@@ -134,7 +155,7 @@ class _Experiments:
         return Tried(trial, fit, strain_of(trial.rig, fit) + trial.handicap)
 
     def given(self, rig: Rig, part: Scene) -> Tried:
-        """The rig as given: adjusted anew, or as the result has it, what fits better."""
+        """The rig as given: adjusted anew, or as the result has it."""
         trial = Trial(code="", what="", remedy="", rig=rig)
         placement = part.cam_from_rig if rig.cam_from_rig is None else rig.cam_from_rig
         fit = fit_of(retriangulated_where_lost(part), placement)
@@ -226,6 +247,8 @@ def _port_evidence(base: Tried, one: Tried) -> list[str]:
     if not before or base.strain < 1.0:
         return []
     text = f"ports at {_millimetres(before)}"
+    if after and np.allclose(before, after, rtol=0.1, atol=1e-3):
+        return []
     if after:
         text += f" become {_millimetres(after)} (rig file: {_millimetres(given)})"
         return [text]

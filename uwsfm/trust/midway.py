@@ -30,9 +30,6 @@ the frame."""
 class ZoomTrial(Trial):
     """Focal lengths of their own before and after a frame."""
 
-    first: int
-    """From which on."""
-
     def fit(self, scene: Scene, options: dict[str, Any]) -> Fit | None:
         halves = []
         for late in (False, True):
@@ -85,9 +82,10 @@ def coarse_firsts(num_frames: int) -> list[int]:
     return np.unique(places.round().astype(int)).tolist()
 
 
-def fine_firsts(best: int, num_frames: int) -> list[int]:
-    """Those between the best of `coarse_firsts`, by its index, and its neighbours."""
+def fine_firsts(first: int, num_frames: int) -> list[int]:
+    """Those between the best of `coarse_firsts` and its neighbours there."""
     coarse = coarse_firsts(num_frames)
+    best = coarse.index(first)
     low = coarse[max(best - 1, 0)]
     high = coarse[min(best + 1, len(coarse) - 1)]
     return [first for first in range(low + 1, high) if first not in coarse]

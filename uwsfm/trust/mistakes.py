@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ class Trial:
     """The observations put right, and poses to start from."""
     options: dict[str, Any] = field(default_factory=dict)
     """Further fields of `CalibrateOptions`."""
+    first: int = 0
+    """The frame from which on something changed."""
     handicap: float = 0.0
     """What a trial that frees numbers must be better by: it always fits better."""
     estimate: Callable[[Fit], str] = lambda fit: ""
@@ -130,8 +133,8 @@ def _free_lenses(rig: Rig) -> Iterator[Trial]:
     yield Trial(
         code="focal",
         what=f"the focal length of {names} is wrong",
-        remedy="check fx and fy: were they calibrated with this zoom, focus and video "
-        "mode, and at this image size?",
+        remedy="check fx and fy: zoom, focus, video mode and image size must be those "
+        "of the calibration",
         rig=rig,
         options=FOCAL,
         handicap=FREE,
@@ -140,8 +143,8 @@ def _free_lenses(rig: Rig) -> Iterator[Trial]:
     yield Trial(
         code="principal_point",
         what=f"the principal point of {names} is wrong",
-        remedy="check cx and cy: was the lens calibrated with another crop, image size "
-        "or pixel origin?",
+        remedy="check cx and cy: crop, image size and pixel origin must be those of "
+        "the calibration",
         rig=rig,
         options=CENTER,
         handicap=FREE,
@@ -175,7 +178,7 @@ def shifts(
                 what=what,
                 remedy=f"{remedy}; one may be missing",
                 rig=rig,
-                seen=lambda scene, c=camera, k=shift: shifted(scene, c, k, first),
+                seen=partial(shifted, camera=camera, shift=shift, first=first),
             )
 
 

@@ -20,7 +20,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.refine import retriangulated, rig_options
@@ -103,7 +103,7 @@ def adjusted(scene: Scene, rig: Rig, **options: Any) -> Fit | None:
                     "max_iterations": iterations,
                 }
             )
-            start = _solved(retriangulated(start, everything), settings)
+            start = _solved(retriangulated(start, everything), settings, rig)
     except (UwsfmError, np.linalg.LinAlgError):
         return None
     return fit_of(retriangulated_where_lost(start), placement)
@@ -146,7 +146,7 @@ def retriangulated_where_lost(scene: Scene) -> Scene:
     return replace(scene, points=points)
 
 
-def _solved(scene: Scene, settings: CalibrateOptions) -> Scene:
+def _solved(scene: Scene, settings: CalibrateOptions, rig: Rig) -> Scene:
     keep = _usable(scene)
     if np.count_nonzero(keep) < MIN_OBSERVATIONS:
         raise UwsfmError("too few observations start near their points")
@@ -159,7 +159,11 @@ def _solved(scene: Scene, settings: CalibrateOptions) -> Scene:
         point_idx=renumber.astype(np.int64),
         xy=scene.xy[keep],
     )
-    run = Run(part, part, settings, Outside(part, Lengths()), None)
+    # What is known beforehand is known of the rig's numbers, not of the first round's.
+    known = replace(part, cameras=rig.refractive_cameras())
+    if rig.cam_from_rig is not None:
+        known = replace(known, cam_from_rig=rig.cam_from_rig)
+    run = Run(part, known, settings, Outside(part, Lengths()), None)
     every = np.ones(part.num_observations, dtype=bool)
     solved = run.solve(run.outside.start(part), every, "cauchy")
     result = solved.state.to_scene(part)
