@@ -49,6 +49,8 @@ MIN_IMAGES = 3
 """That see a point of the finished map."""
 GROWTH = 1.25
 """Everything is adjusted when there are so many times more frames than last time."""
+RENEWAL = 1.6
+"""All tracks are made again when there are so many times more frames than last time."""
 NUM_RIVALS = 3
 """Pairs that begin maps side by side."""
 PROBE_FRAMES = 6
@@ -268,6 +270,7 @@ class Grower:
         self.housings = Housings.of(rig, growing)
         self.housings_moved = False
         self.last_global = 0
+        self.last_renewal = 0
 
     def begin(self, beginning: Beginning) -> None:
         """Place the first frames."""
@@ -320,7 +323,7 @@ class Grower:
             # Turned until now, to make up for the ports that may move from here on.
             if not self.rig.refine_cam_from_rig and self.rig.cam_from_rig is not None:
                 growing.set_cameras(growing.cameras, self.rig.cam_from_rig)
-        for _ in range(rounds):
+        for left in reversed(range(rounds)):
             adjust_globally(growing, housings)
             if housings is not None:
                 scene, _ = growing.scene()
@@ -330,4 +333,17 @@ class Grower:
                         END_ERRORS * np.nanmedian(errors), MIN_ERROR_PX, MAX_ERROR_PX
                     )
                 )
-            growing.retriangulate(self.max_error_px)
+            self._renew_tracks(at_once=rounds > 1, last=rounds > 1 and left == 0)
+
+    def _renew_tracks(self, at_once: bool, last: bool) -> None:
+        """After an adjustment: all tracks anew if the map has grown by much since that
+        was done, or ``at_once``; else without what does not fit any more. After the
+        ``last`` one a map with all frames is left to `finish`."""
+        growing, count = self.map, self.map.num_registered
+        if last and count == growing.correspondences.num_frames:
+            return
+        if not at_once and count < RENEWAL * self.last_renewal:
+            growing.filter(np.arange(len(growing.points)), self.max_error_px)
+            return
+        self.last_renewal = count
+        growing.retriangulate(self.max_error_px)
