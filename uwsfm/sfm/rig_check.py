@@ -17,10 +17,11 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
+from uwsfm.sfm.correction import Correction
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
+from uwsfm.sfm.lens_mistakes import focal_corrections
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
-    Correction,
     corrected_pixels,
     corrections,
     shift_words,
@@ -42,6 +43,8 @@ SAME_MISFIT = 1.5
 """So is an explanation whose rays miss by so many times the best one's."""
 LEAST_MISFIT = 2e-4
 """Radians: a fifth of a pixel, noise."""
+CLEARLY_BETTER = 3.0
+"""So many of these an explanation must gain against the rig as given."""
 MAX_PHRASES = 3
 IDEA_MATCHES = 2000
 """Of a pair of cameras are enough to compare explanations."""
@@ -192,8 +195,7 @@ def _check_counts(
         f"cameras {a!r} and {b!r} share only {len(best)} matches in all frames, at "
         f"least {MIN_RIG_MATCHES} are needed: "
     )
-    ideas = _shift_ideas(rig, cam_from_rig, best, shifted)
-    found = _likely(ideas)
+    found = _likely(_shift_ideas(rig, cam_from_rig, best, shifted))
     if found:
         raise InputError(f"{few}probably {found}")
     raise InputError(
@@ -240,8 +242,13 @@ def remedies(
         cam_from_rig=cam_from_rig,
         baseline_m=float(np.linalg.norm(cam_from_rig[1, 4:])),
     )
-    ideas = [_idea(item, _corrected(item, pair)) for item in corrections(posed)]
-    return _likely([*ideas, *_shift_ideas(rig, cam_from_rig, pair, shifted)])
+    undone = [*corrections(posed), *focal_corrections(posed)]
+    ideas = [_idea(item, _corrected(item, pair)) for item in undone]
+    ideas += _shift_ideas(rig, cam_from_rig, pair, shifted)
+    given = _idea(Correction(code="", rig=posed, what="", remedy=""), pair)
+    least = min([LEAST_MISFIT, *(idea.misfit for idea in ideas)])
+    limit = given.badness(least) - CLEARLY_BETTER
+    return _likely([idea for idea in ideas if idea.badness(least) <= limit])
 
 
 def _corrected(correction: Correction, pair: PairMatches) -> PairMatches:

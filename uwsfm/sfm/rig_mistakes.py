@@ -8,60 +8,29 @@ mistake. Who has observations tries them: `rig_check` on matches of single frame
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
-from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
-from uwsfm.rig import Rig, RigCamera, camera_from_colmap
+from uwsfm.rig import Rig
 from uwsfm.rig_file import FRESH_WATER
 from uwsfm.scene import IndexArray
+from uwsfm.sfm.correction import Correction, quoted, subsets
+from uwsfm.sfm.lens_mistakes import lens_corrections
 
 DOME_RADII_M = (0.05, 0.1)
 """Of domes on the market, about; any radius undoes the most of a wrong flat port."""
 SHIFTS = (1, -1, 2, -2, 3, -3)
 """Frames that one camera may be late or early."""
-SCALES = (2.0, 0.5, 1.5, 2.0 / 3.0, 4.0 / 3.0, 0.75, 4.0, 0.25)
-"""Sizes of an image against that of its calibration: 4K, 1080p, 720p, binning."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Correction:
-    """A rig without one mistake."""
-
-    code: str
-    """Which mistake, one of `CODES`."""
-    rig: Rig
-    what: str
-    """The mistake, a clause that names the cameras."""
-    remedy: str
-    """What to change in the rig file or the images: an imperative clause."""
-    exchanged: bool = False
-    """The images of the first two cameras change places."""
-    flipped: int | None = None
-    """Every image is mirrored along this axis: 0 left to right, 1 top to bottom."""
 
 
 def corrections(rig: Rig) -> list[Correction]:
     """Every mistake undone, singly: of the lenses, the ports and the placement."""
     found = [*port_corrections(rig), *lens_corrections(rig), *pose_corrections(rig)]
     return [*found, *image_corrections(rig)]
-
-
-def _quoted(rig: Rig, which: tuple[int, ...]) -> str:
-    return " and ".join(repr(rig.cameras[c].name) for c in which)
-
-
-def _subsets(rig: Rig, applies: Callable[[RigCamera], bool]) -> list[tuple[int, ...]]:
-    """All cameras that a mistake may concern, then each of them alone."""
-    every = tuple(c for c, camera in enumerate(rig.cameras) if applies(camera))
-    if len(every) < 2:
-        return [every] if every else []
-    return [every, *((c,) for c in every)]
 
 
 def _with_ports(
@@ -85,8 +54,8 @@ def _with_ports(
 
 def port_corrections(rig: Rig) -> Iterator[Correction]:
     """The port itself: none, missing, of the other kind, in another water."""
-    for which in _subsets(rig, lambda c: not isinstance(c.port, NoPort)):
-        names = _quoted(rig, which)
+    for which in subsets(rig, lambda c: not isinstance(c.port, NoPort)):
+        names = quoted(rig, which)
         yield Correction(
             code="port_none",
             rig=_with_ports(rig, which, lambda _: NoPort()),
@@ -105,8 +74,8 @@ def missing_ports(rig: Rig) -> Iterator[Correction]:
 
     Any flat port will do for it: what it does to rays is mostly the water's.
     """
-    for which in _subsets(rig, lambda c: isinstance(c.port, NoPort))[:1]:
-        names = _quoted(rig, which)
+    for which in subsets(rig, lambda c: isinstance(c.port, NoPort))[:1]:
+        names = quoted(rig, which)
         yield Correction(
             code="port_missing",
             rig=_with_ports(rig, which, lambda _: FlatPort(), free=True),
@@ -117,8 +86,8 @@ def missing_ports(rig: Rig) -> Iterator[Correction]:
 
 
 def _other_kinds(rig: Rig) -> Iterator[Correction]:
-    for which in _subsets(rig, lambda c: isinstance(c.port, FlatPort)):
-        names = _quoted(rig, which)
+    for which in subsets(rig, lambda c: isinstance(c.port, FlatPort)):
+        names = quoted(rig, which)
         for radius in DOME_RADII_M:
             yield Correction(
                 code="dome_as_flat",
@@ -126,8 +95,8 @@ def _other_kinds(rig: Rig) -> Iterator[Correction]:
                 what=f"the port of {names} is a dome, and not flat",
                 remedy=f"describe the port of {names} as type: dome",
             )
-    for which in _subsets(rig, lambda c: isinstance(c.port, DomePort)):
-        names = _quoted(rig, which)
+    for which in subsets(rig, lambda c: isinstance(c.port, DomePort)):
+        names = quoted(rig, which)
         yield Correction(
             code="flat_as_dome",
             rig=_with_ports(rig, which, _as_flat, free=True),
@@ -174,234 +143,12 @@ def _other_waters(rig: Rig) -> Iterator[Correction]:
         )
 
 
-def with_lens(camera: RigCamera, model: str, params: Array) -> RigCamera | None:
-    """The camera with another lens; None if no lens can have such parameters."""
-    old = camera.camera
-    try:
-        lens = camera_from_colmap(model, old.width, old.height, params.tolist())
-    except InputError:
-        return None
-    return replace(camera, camera=lens)
-
-
-_Change = Callable[[RigCamera], RigCamera | None]
-
-
-def _changed(rig: Rig, which: tuple[int, ...], change: _Change) -> Rig | None:
-    cameras = list(rig.cameras)
-    for c in which:
-        other = change(cameras[c])
-        if other is None:
-            return None
-        cameras[c] = other
-    return replace(rig, cameras=tuple(cameras))
-
-
-def num_pinhole(camera: RigCamera) -> int:
-    """How many of a lens's parameters come before its distortion: 3 or 4."""
-    lens = camera.camera
-    return len(lens.focal_length_idxs()) + len(lens.principal_point_idxs())
-
-
-def distortion(camera: RigCamera) -> Array:
-    """The distortion parameters of a lens, in the order of its model."""
-    return np.array(camera.camera.params[num_pinhole(camera) :])
-
-
-def _distorts(camera: RigCamera) -> bool:
-    return bool(np.any(distortion(camera) != 0.0))
-
-
-def lens_corrections(rig: Rig) -> Iterator[Correction]:
-    """The lens: its size, its centre, its distortion."""
-    kinds = (
-        ("undistorted", _undistortions),
-        ("distortion_sign", _signs),
-        ("distortion_order", _orders),
-        ("fisheye", _fisheyes),
-        ("resolution", _resolutions),
-        ("principal_point", _centers),
-    )
-    for code, variants in kinds:
-        applies = _distorts if code in _OF_DISTORTION else lambda _: True
-        for which in _subsets(rig, applies):
-            if code == "resolution" and len(which) < len(rig.cameras):
-                continue  # cameras of one rig are calibrated in one way
-            for what, remedy, change in variants(rig.cameras[which[0]]):
-                other = _changed(rig, which, change)
-                if other is None:
-                    continue
-                names = _quoted(rig, which)
-                yield Correction(
-                    code=code,
-                    rig=other,
-                    what=what.format(names=names),
-                    remedy=remedy.format(names=names),
-                )
-
-
-_OF_DISTORTION = ("undistorted", "distortion_sign", "distortion_order", "fisheye")
-_Variant = tuple[str, str, _Change]
-
-
-def _with_distortion(change: Callable[[Array], Array]) -> _Change:
-    def changed(camera: RigCamera) -> RigCamera | None:
-        params = np.array(camera.camera.params)
-        first = num_pinhole(camera)
-        params[first:] = change(params[first:])
-        return with_lens(camera, camera.camera.model_name, params)
-
-    return changed
-
-
-def _undistortions(_: RigCamera) -> Iterator[_Variant]:
-    yield (
-        "the images of {names} are undistorted already",
-        "give the images as the camera took them, or a lens without distortion "
-        "(model PINHOLE) for {names}",
-        _with_distortion(np.zeros_like),
-    )
-
-
-def _signs(camera: RigCamera) -> Iterator[_Variant]:
-    what = "the distortion of {names} has the wrong sign"
-    remedy = (
-        "change the sign of the distortion coefficients of {names}: they must map from "
-        "the undistorted to the distorted image"
-    )
-    yield what, remedy, _with_distortion(np.negative)
-    if camera.camera.model_name == "OPENCV":
-        yield (
-            f"{what}: that of k1 and k2 alone",
-            remedy,
-            _with_distortion(lambda v: v * [-1.0, -1.0, 1.0, 1.0]),
-        )
-        yield (
-            f"{what}: they undistort",
-            "give the coefficients of {names} that distort, not those that undistort",
-            _with_distortion(_inverse_polynomial),
-        )
-
-
-def _inverse_polynomial(undistortion: Array) -> Array:
-    """OPENCV's coefficients that undo others, to fifth order in the radius."""
-    k1, k2, p1, p2 = undistortion
-    return np.array([-k1, 3.0 * k1**2 - k2, -p1, -p2])
-
-
-def _orders(camera: RigCamera) -> Iterator[_Variant]:
-    remedy = (
-        "put the distortion coefficients of {names} in the order of the model: "
-        f"{camera.camera.params_info}"
-    )
-    model = camera.camera.model_name
-    if model == "FULL_OPENCV":
-        yield (
-            "the distortion coefficients of {names} are in the order "
-            "k1, k2, k3, p1, p2",
-            remedy,
-            _with_distortion(_in_order((0, 1, 3, 4, 2, 5, 6, 7))),
-        )
-    if model != "OPENCV":
-        return
-
-    def radial_three(item: RigCamera) -> RigCamera | None:
-        k1, k2, k3, p1 = distortion(item)
-        params = [*item.camera.params[:4], k1, k2, p1, 0.0, k3, 0.0, 0.0, 0.0]
-        return with_lens(item, "FULL_OPENCV", np.array(params))
-
-    yield (
-        "the distortion coefficients of {names} are in the order k1, k2, k3, p1 "
-        "(MATLAB, Metashape)",
-        remedy,
-        radial_three,
-    )
-    yield (
-        "the distortion coefficients of {names} are in the order k1, k2, k3, p1 "
-        "(MATLAB, Metashape), and k3 is no part of the lens",
-        remedy,
-        _with_distortion(lambda v: np.array([v[0], v[1], v[3], 0.0])),
-    )
-    for order in _OPENCV_ORDERS:
-        read = np.argsort(order).tolist()
-        yield (
-            "the distortion coefficients of {names} are in the order "
-            f"{', '.join(_OPENCV_NAMES[k] for k in read)}",
-            remedy,
-            _with_distortion(_in_order(order)),
-        )
-
-
-def _in_order(order: tuple[int, ...]) -> Callable[[Array], Array]:
-    return lambda values: values[list(order)]
-
-
-_OPENCV_NAMES = ("k1", "k2", "p1", "p2")
-_OPENCV_ORDERS = ((2, 3, 0, 1), (1, 0, 2, 3), (0, 1, 3, 2), (0, 2, 1, 3), (3, 2, 1, 0))
-"""Where k1, k2, p1 and p2 may stand in a file instead."""
-
-
-def _fisheyes(camera: RigCamera) -> Iterator[_Variant]:
-    fisheye = camera.camera.model_name == "OPENCV_FISHEYE"
-    if not fisheye and camera.camera.model_name not in ("OPENCV", "FULL_OPENCV"):
-        return
-    other = "OPENCV" if fisheye else "OPENCV_FISHEYE"
-    is_no = "is no fisheye" if fisheye else "is a fisheye"
-
-    def exchanged(item: RigCamera) -> RigCamera | None:
-        return with_lens(item, other, np.array(item.camera.params[:8]))
-
-    yield (
-        f"the lens of {{names}} {is_no}",
-        f"write model: {other} for {{names}}, with the same numbers",
-        exchanged,
-    )
-
-
-def scaled_lens(camera: RigCamera, scale: float) -> RigCamera | None:
-    """The lens of an image ``scale`` times as large."""
-    params = np.array(camera.camera.params)
-    params[: num_pinhole(camera)] *= scale
-    return with_lens(camera, camera.camera.model_name, params)
-
-
-def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
-    lens = camera.camera
-    centred = 0.5 * lens.width / lens.principal_point_x
-    scales = [s for s in SCALES if abs(s / centred - 1.0) > 0.1]
-    if abs(centred - 1.0) > 0.1:
-        scales.insert(0, centred)
-    for scale in scales:
-        yield (
-            f"the lens of {{names}} was calibrated at another resolution, of images "
-            f"{1.0 / scale:.3g} times as large",
-            "give the lens of {names} for the image size that is in the file: multiply "
-            f"fx, fy, cx and cy by {scale:.3g}",
-            partial(scaled_lens, scale=scale),
-        )
-
-
-def _centers(camera: RigCamera) -> Iterator[_Variant]:
-    def centred(item: RigCamera) -> RigCamera | None:
-        params = np.array(item.camera.params)
-        middle = 0.5 * item.camera.width, 0.5 * item.camera.height
-        params[list(item.camera.principal_point_idxs())] = middle
-        return with_lens(item, item.camera.model_name, params)
-
-    yield (
-        "the principal point of {names} is in the middle of the image",
-        "give cx and cy of {names} in pixels of these images: crop, image size and "
-        "pixel origin must be those of the calibration",
-        centred,
-    )
-
-
 def pose_corrections(rig: Rig) -> Iterator[Correction]:
     """The placement: `cam_from_rig` of every camera but the first, read otherwise."""
     poses = rig.cam_from_rig
     if poses is None or len(poses) < 2:
         return
-    names = _quoted(rig, tuple(range(1, len(poses))))
+    names = quoted(rig, tuple(range(1, len(poses))))
     for code, what, remedy, change in _POSES:
         other = poses.copy()
         other[1:] = change(poses[1:])
@@ -513,30 +260,3 @@ def corrected_pixels(
     if correction.exchanged:
         camera = np.where(camera < 2, 1 - camera, camera)
     return camera, pixels
-
-
-CODES = (
-    "port_none",
-    "port_missing",
-    "undistorted",
-    "rotation_transposed",
-    "pose_inverted",
-    "quaternion_order",
-    "principal_point",
-    "focal",
-    "resolution",
-    "distortion_order",
-    "distortion_sign",
-    "fisheye",
-    "dome_as_flat",
-    "flat_as_dome",
-    "folders_swapped",
-    "mirrored",
-    "frames_shifted",
-    "zoom_changed",
-    "length_unit",
-    "baseline",
-    "water_index",
-    "translation_sign",
-)
-"""Names of the mistakes, as in reports."""

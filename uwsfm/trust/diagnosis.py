@@ -28,7 +28,7 @@ from uwsfm.trust.midway import (
 from uwsfm.trust.mistakes import Trial, length_trials, trials
 from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
 
-UNIT = 0.03
+UNIT = 0.02
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
 CLEAR = 4.0
 """An explanation must be better than the rig as given by so many."""
@@ -39,7 +39,7 @@ MAX_TILT_DEG = 15.0
 RULER_M, RULER_SHARE = 0.01, 0.5
 """What a port's distance in a rig file is taken to be known to: a ruler held against a
 housing, to the centre of a lens that nobody sees."""
-AT_ZERO = 1.5
+AT_ZERO = 2.0
 """Strain of a port that came out at its lens, which no housing has."""
 MAX_EXPLANATIONS = 3
 
@@ -49,7 +49,7 @@ class Explanation:
     """A mistake that explains the observations."""
 
     code: str
-    """See `uwsfm.sfm.rig_mistakes.CODES`."""
+    """See `uwsfm.sfm.correction.CODES`."""
     text: str
     """A sentence for people: the mistake, its evidence, and what to change."""
     rms_before_px: float
@@ -57,7 +57,7 @@ class Explanation:
     rms_after_px: float
     """With the mistake undone."""
     gain: float
-    """How much better, in steps of 3 % of the RMS; ports and placement that stay near
+    """How much better, in steps of 2 % of the RMS; ports and placement that stay near
     the rig file's count as well."""
 
     def to_json(self) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class Tried:
     trial: Trial
     fit: Fit
     strain: float
-    """How implausible its numbers are, in steps of 3 % of the RMS."""
+    """How implausible its numbers are, in steps of 2 % of the RMS."""
 
     @property
     def total(self) -> float:
@@ -131,11 +131,18 @@ def diagnose(
         best = min(range(len(coarse)), key=lambda k: coarse[k].total)
         near = fine_firsts(coarse[best].trial.first, part.num_frames)
         coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
-    tried += coarse
+    tried += _more_than_focal(coarse, tried)
     if tried:
         best_fit = min(tried, key=lambda one: one.total).fit
         base = experiments.again(base, best_fit, part)
     return explanations(base, tried)
+
+
+def _more_than_focal(zoomed: list[Tried], tried: Sequence[Tried]) -> list[Tried]:
+    """Changes of zoom that explain clearly more than one wrong focal length does."""
+    focal = [one.total for one in tried if one.trial.code == "focal"]
+    limit = min(focal, default=math.inf) - CLEAR
+    return [one for one in zoomed if one.total <= limit]
 
 
 class _Experiments:

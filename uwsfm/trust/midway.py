@@ -44,6 +44,7 @@ class ZoomTrial(Trial):
         return replace(
             halves[0],
             squares=np.concatenate([half.squares for half in halves]),
+            unknowns=sum(half.unknowns for half in halves),
             turn_deg=max(half.turn_deg for half in halves),
             focals=(before, after),
         )

@@ -18,9 +18,9 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
+from uwsfm.sfm.correction import Correction
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
-    Correction,
     corrected_pixels,
     corrections,
     shift_words,
@@ -232,6 +232,7 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
             what=f"the glass is {times:.3g} times as thick as in the rig file",
             remedy="check the unit of thickness_m, which is metres",
             rig=_with_port_length(rig, "thickness", times),
+            handicap=FREE,
         )
 
 

@@ -46,6 +46,8 @@ class Fit:
     """Adjusted; points are those of the part that was tried."""
     squares: Array
     """(N,) squared errors, px^2; `UNEXPLAINED_PX` squared where there is none."""
+    unknowns: int
+    """Coordinates of points and poses that were adjusted to them."""
     turn_deg: float
     """The largest turn of a camera from the placement of the trial's rig."""
     swing_deg: float
@@ -55,8 +57,12 @@ class Fit:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square length of the error of the best `TRIMMED` observations."""
-        return trimmed_rms(self.squares)
+        """Root mean square error of the best `TRIMMED` observations, corrected for the
+        number of unknowns: tracks that are cut in two fit better, right or wrong."""
+        count = 2 * len(self.squares)
+        share = max(count - self.unknowns, 0.05 * count) / count
+        best = np.sort(self.squares)[: max(int(TRIMMED * len(self.squares)), 1)]
+        return float(np.sqrt(np.mean(best) / share))
 
     def distances_m(self) -> list[float]:
         """Of the flat ports."""
@@ -66,11 +72,6 @@ class Fit:
         """Of the flat ports, against the optical axis."""
         normals = [p.normal for p in self.scene.ports if isinstance(p, FlatPort)]
         return [float(np.degrees(np.arccos(min(n[2], 1.0)))) for n in normals]
-
-
-def trimmed_rms(squares: Array) -> float:
-    best = np.sort(squares)[: max(int(TRIMMED * len(squares)), 1)]
-    return float(np.sqrt(np.mean(best)))
 
 
 def adjusted(scene: Scene, rig: Rig, **options: Any) -> Fit | None:
@@ -121,6 +122,7 @@ def fit_of(scene: Scene, placement: Array) -> Fit:
     return Fit(
         scene=scene,
         squares=np.minimum(squares, UNEXPLAINED_PX**2),
+        unknowns=3 * len(np.unique(scene.point_idx)) + 6 * scene.num_frames,
         turn_deg=float(np.degrees(rigid3.rotation_angle(turns)).max()),
         swing_deg=float(np.degrees(swing).max(initial=0.0)),
     )
