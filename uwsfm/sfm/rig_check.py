@@ -91,10 +91,14 @@ def check_rig(
         names = rig.cameras[a].name, rig.cameras[b].name
         found = remedies(rig, cam_from_rig, pair, shifted)
         if found:
+            evidence = (
+                f"only {in_front:.0%} of the points that both see lie in front of them"
+                if in_front < MIN_IN_FRONT
+                else f"rays of the same point miss by {np.degrees(misfit):.1f} degrees"
+            )
             raise InputError(
                 f"cameras {names[0]!r} and {names[1]!r} contradict their images: as "
-                f"described, only {in_front:.0%} of the points that both see lie in "
-                f"front of them; probably {found}"
+                f"described, {evidence}; probably {found}"
             )
         if in_front < MIN_IN_FRONT:
             raise InputError(

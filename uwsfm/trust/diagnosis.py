@@ -30,7 +30,7 @@ from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
 
 UNIT = 0.02
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
-CLEAR = 4.0
+CLEAR = 2.5
 """An explanation must be better than the rig as given by so many."""
 TIE = 1.5
 """Explanations nearer than this to the best cannot be told apart."""
@@ -76,6 +76,28 @@ class Tried:
     @property
     def total(self) -> float:
         return math.log(max(self.fit.rms_px, 1e-9)) / UNIT + self.strain
+
+
+def explain(
+    verdict: str,
+    rig: Rig,
+    calibration: CalibrationResult,
+    frame_names: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> tuple[Explanation, ...]:
+    """`diagnose`, where the verdict on a result is not that it fits.
+
+    Args:
+        verdict: "fits" ends the matter.
+        rig: As given.
+        calibration: The result.
+        frame_names: As of `diagnose`.
+        progress: Called with each trial.
+    """
+    if verdict == "fits":
+        return ()
+    scene, _ = calibration.scene.select(calibration.inliers)
+    return diagnose(rig, scene, frame_names, progress, **options_of(calibration))
 
 
 def options_of(calibration: CalibrationResult) -> dict[str, Any]:

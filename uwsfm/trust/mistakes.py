@@ -27,6 +27,8 @@ from uwsfm.sfm.rig_mistakes import (
 )
 from uwsfm.trust.trials import Fit, adjusted
 
+RARER = {"dome_as_flat": 0.3, "water_index": 0.6}
+"""Handicap of what looks like a lens calibrated in the water, and happens less."""
 MIN_FRAMES_LEFT = 2
 """On each side of a frame from which on something changed."""
 UNITS = {
@@ -91,6 +93,7 @@ def _of_correction(correction: Correction) -> Trial:
         remedy=correction.remedy,
         rig=correction.rig,
         seen=lambda scene: _corrected(scene, correction),
+        handicap=RARER.get(correction.code, 0.0),
     )
 
 
@@ -115,7 +118,7 @@ def _mirrored(poses: Array, axis: int) -> Array:
     return poses * signs
 
 
-FREE = 2.5
+FREE = 1.0
 """Handicap of two numbers that are set free for each camera."""
 FOCAL = {"refine_focal": True, "focal_stddev": 0.5}
 CENTER = {"refine_principal_point": True, "principal_point_stddev_px": 200.0}
