@@ -6,6 +6,7 @@ here is how the numbers of calibrations differ from those that a rig file takes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -18,6 +19,9 @@ from uwsfm.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.sfm.correction import Correction, quoted, subsets
 
 FOCAL_FACTORS = (0.75, 0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.3)
+"""What a wrong zoom or video mode makes of a focal length, in steps."""
+SAME_SCALE = 0.08
+"""How far off the middle a principal point may be, relative."""
 SCALES = (2.0, 0.5, 1.5, 2.0 / 3.0, 4.0 / 3.0, 0.75, 4.0, 0.25)
 """Sizes of an image against that of its calibration: 4K, 1080p, 720p, binning."""
 
@@ -73,8 +77,6 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
     for code, variants in kinds:
         applies = _distorts if code in _OF_DISTORTION else lambda _: True
         for which in subsets(rig, applies):
-            if code == "resolution" and len(which) < len(rig.cameras):
-                continue  # cameras of one rig are calibrated in one way
             for what, remedy, change in variants(rig.cameras[which[0]]):
                 other = _changed(rig, which, change)
                 if other is None:
@@ -238,12 +240,13 @@ def scaled_lens(camera: RigCamera, scale: float) -> RigCamera | None:
 
 
 def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
+    """The size for which the principal point is in the middle, if not this one."""
     lens = camera.camera
-    centred = 0.5 * lens.width / lens.principal_point_x
-    scales = [s for s in SCALES if abs(s / centred - 1.0) > 0.1]
-    if abs(centred - 1.0) > 0.1:
-        scales.insert(0, centred)
-    for scale in scales:
+    scale = 0.5 * lens.width / lens.principal_point_x
+    usual = min((1.0, *SCALES), key=lambda known: abs(math.log(known / scale)))
+    if abs(math.log(usual / scale)) < SAME_SCALE:
+        scale = usual
+    if scale != 1.0:
         yield (
             f"the lens of {{names}} was calibrated at another resolution, of images "
             f"{1.0 / scale:.3g} times as large",
