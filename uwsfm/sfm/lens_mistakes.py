@@ -215,12 +215,13 @@ def focal_corrections(rig: Rig) -> Iterator[Correction]:
             other = _changed(rig, (c,), partial(_with_focal, factor=factor))
             if other is None:
                 continue
-            way = "long" if factor < 1.0 else "short"
+            way, other_way = ("long", "short")[:: 1 if factor < 1.0 else -1]
             yield Correction(
                 code="focal",
                 rig=other,
                 what=f"the focal length of {item.name!r} is about "
-                f"{abs(1.0 / factor - 1.0):.0%} too {way}",
+                f"{abs(1.0 / factor - 1.0):.0%} too {way}, or another camera's too "
+                f"{other_way}",
                 remedy="check fx and fy: zoom, focus, video mode and image size must "
                 "be those of the calibration",
             )

@@ -7,12 +7,12 @@ with a plausible error: only the points that both cameras see in one frame tell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm.errors import InputError
+from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
@@ -46,7 +46,7 @@ LEAST_MISFIT = 2e-4
 CLEARLY_BETTER = 3.0
 """So many of these an explanation must gain against the rig as given."""
 MAX_PHRASES = 3
-IDEA_MATCHES = 2000
+IDEA_MATCHES = 800
 """Of a pair of cameras are enough to compare explanations."""
 POSE_HINT = (
     "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
@@ -96,9 +96,10 @@ def check_rig(
                 if in_front < MIN_IN_FRONT
                 else f"rays of the same point miss by {np.degrees(misfit):.1f} degrees"
             )
-            raise InputError(
+            raise ExplainedInputError(
                 f"cameras {names[0]!r} and {names[1]!r} contradict their images: as "
-                f"described, {evidence}; probably {found}"
+                f"described, {evidence}; probably {_words(found)}",
+                tuple(found),
             )
         if in_front < MIN_IN_FRONT:
             raise InputError(
@@ -144,9 +145,10 @@ def check_rotation(
     a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
     found = remedies(rig, cam_from_rig, pair, shifted)
     if found:
-        raise InputError(
-            f"cameras {a!r} and {b!r} contradict their images: probably {found}; else "
-            f"cam_from_rig of {b!r} is wrong"
+        raise ExplainedInputError(
+            f"cameras {a!r} and {b!r} contradict their images: probably "
+            f"{_words(found)}; else cam_from_rig of {b!r} is wrong",
+            tuple(found),
         )
     if turn > MAX_TURN_DEG:
         raise InputError(
@@ -201,7 +203,7 @@ def _check_counts(
     )
     found = _likely(_shift_ideas(rig, cam_from_rig, best, shifted))
     if found:
-        raise InputError(f"{few}probably {found}")
+        raise ExplainedInputError(f"{few}probably {_words(found)}", tuple(found))
     raise InputError(
         f"{few}do their images overlap, were images of equal names taken at the same "
         "time, is one camera mirrored, is the water clear enough?"
@@ -229,8 +231,8 @@ def remedies(
     cam_from_rig: Array,
     pair: PairMatches,
     shifted: Shifted | None = None,
-) -> str:
-    """What to change, in words: the mistakes that explain the matches of two cameras.
+) -> dict[str, str]:
+    """The mistakes that explain the matches of two cameras, and what to change.
 
     Args:
         rig: As given.
@@ -239,7 +241,7 @@ def remedies(
         shifted: As of `check_rig`.
 
     Returns:
-        An empty text where none does.
+        Clauses by the names of the mistakes, likeliest first; empty if none explains.
     """
     posed = replace(
         rig,
@@ -297,11 +299,15 @@ def _shift_ideas(
     return ideas
 
 
-def _likely(ideas: Sequence[_Idea]) -> str:
+def _words(found: Mapping[str, str]) -> str:
+    return " or ".join(found.values())
+
+
+def _likely(ideas: Sequence[_Idea]) -> dict[str, str]:
     """The explanations that tilted ports allow and that fit best, one of each kind."""
     fitting = [i for i in ideas if i.turn_deg <= MAX_TURN_DEG and i.misfit <= MAX_REST]
     if not fitting:
-        return ""
+        return {}
     least = min(idea.misfit for idea in fitting)
     fitting.sort(key=lambda idea: idea.badness(least))
     limit = fitting[0].badness(least) + 1.0
@@ -309,7 +315,7 @@ def _likely(ideas: Sequence[_Idea]) -> str:
     for idea in fitting:
         if idea.badness(least) <= limit:
             phrases.setdefault(idea.code, idea.phrase)
-    return " or ".join(list(phrases.values())[:MAX_PHRASES])
+    return dict(list(phrases.items())[:MAX_PHRASES])
 
 
 def _idea(correction: Correction, pair: PairMatches) -> _Idea:
