@@ -15,13 +15,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.tracks import match_gaps_px
 from uwsfm.sfm.mapping.triangulation import Views
 from uwsfm.sfm.relative_pose import estimate_relative_pose
@@ -131,6 +134,36 @@ def noise_floor(
     # The poses of a wrong map may lead its pairs astray, too: they look for their own.
     alone = [(rows, _pair_gaps(scene, rows, own_start=True)) for rows in pairs]
     return _pooled(scene, alone)
+
+
+def map_floor(
+    of: Correspondences,
+    registered: NDArray[np.bool_],
+    cameras: Sequence[RefractiveCamera],
+    cam_from_rig: Array,
+    rig_from_world: Array,
+    seed: int,
+) -> NoiseFloor | None:
+    """`noise_floor` of the verified matches between the frames of a map.
+
+    Args:
+        of: Keypoints and matches.
+        registered: (F,) frames of the map.
+        cameras, cam_from_rig, rig_from_world: Of the map, as in a `Scene`.
+        seed: Of the draw of pairs and matches.
+    """
+    inside = registered[of.frame[of.matches]].all(axis=1) & of.verified
+    keypoints = Scene(
+        cameras=tuple(cameras),
+        cam_from_rig=cam_from_rig,
+        rig_from_world=rig_from_world,
+        points=np.empty((0, 3)),
+        camera_idx=of.camera,
+        frame_idx=of.frame,
+        point_idx=np.zeros(len(of.xy), dtype=np.int64),
+        xy=of.xy,
+    )
+    return noise_floor(keypoints, of.matches[inside], seed)
 
 
 def _pooled(

@@ -20,7 +20,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
-from uwsfm.scene import IndexArray, Scene
+from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.adjustment import (
     Housings,
     adjust_globally,
@@ -39,14 +39,14 @@ from uwsfm.sfm.mapping.initialization import (
     start_tolerance_px,
 )
 from uwsfm.sfm.mapping.registration import Ranking, register_next
-from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
+from uwsfm.sfm.noise_floor import map_floor
 from uwsfm.sfm.options import StartOptions
 
 MIN_FRAMES_FOR_HOUSINGS = 3
 END_ERRORS = 6.0
 """Times the median error: the tolerance once the housings are adjusted."""
 MIN_IMAGES = 3
-"""That see a point of the finished map."""
+"""That see a point of the finished map: of a rig, in two frames or more."""
 GROWTH = 1.25
 """Everything is adjusted when there are so many times more frames than last time."""
 RENEWAL = 1.6
@@ -127,7 +127,14 @@ class _Search:
             self.num_tried += 1
             growing = self._grown(group)
             if growing.num_registered > 1:
-                growing.floor = map_floor(growing, self.seed)
+                growing.floor = map_floor(
+                    growing.correspondences,
+                    growing.registered,
+                    growing.cameras,
+                    growing.cam_from_rig,
+                    growing.rig_from_world,
+                    self.seed,
+                )
             best, rival = _better(best, growing)
             if self._in_doubt(best, rival) and num_again < MAX_AGAIN:
                 num_again += 1
@@ -219,24 +226,6 @@ def explained(growing: GrowingMap, max_error_px: float) -> float:
     return float(np.mean(fit)) * min(growing.num_registered / PROBE_FRAMES, 1.0)
 
 
-def map_floor(growing: GrowingMap, seed: int) -> NoiseFloor | None:
-    """What the verified matches between the frames of a map leave, and what their pairs
-    alone would."""
-    of = growing.correspondences
-    inside = growing.registered[of.frame[of.matches]].all(axis=1) & of.verified
-    keypoints = Scene(
-        cameras=growing.cameras,
-        cam_from_rig=growing.cam_from_rig,
-        rig_from_world=growing.rig_from_world,
-        points=np.empty((0, 3)),
-        camera_idx=of.camera,
-        frame_idx=of.frame,
-        point_idx=np.zeros(len(of.xy), dtype=np.int64),
-        xy=of.xy,
-    )
-    return noise_floor(keypoints, of.matches[inside], seed)
-
-
 def _better(
     best: GrowingMap | None, other: GrowingMap
 ) -> tuple[GrowingMap, GrowingMap | None]:
@@ -307,6 +296,8 @@ class Grower:
         self.grow(growing.correspondences.num_frames)
         if growing.num_registered > 1:
             growing.retriangulate(self.max_error_px, MIN_IMAGES)
+            if len(growing.cameras) == 1:  # two images are two frames
+                growing.add_pairs(self.max_error_px)
 
     def _place(self, frames: IndexArray, rig_from_world: Array) -> None:
         poses = self.map.rig_from_world.copy()
