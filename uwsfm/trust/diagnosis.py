@@ -30,7 +30,7 @@ from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
 
 UNIT = 0.02
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
-CLEAR = 2.5
+CLEAR = 1.5
 """An explanation must be better than the rig as given by so many."""
 TIE = 1.5
 """Explanations nearer than this to the best cannot be told apart."""
