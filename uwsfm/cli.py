@@ -352,10 +352,19 @@ def demo(
 def _print_result(summary: dict) -> None:
     from rich.markup import escape
 
-    from uwsfm.console import console, housing_table, result_table, timings_table
+    from uwsfm.console import (
+        FEW_BUDGET_ROWS,
+        budget_table,
+        console,
+        housing_table,
+        result_table,
+        timings_table,
+    )
 
     console.print(result_table(summary))
     console.print(housing_table(summary))
+    if len(summary["error_budget"]) > 1:  # something was given that may be wrong
+        console.print(budget_table(summary, FEW_BUDGET_ROWS))
     for warning in summary["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
     earlier = summary.get("steps_of_earlier_runs", ())

@@ -26,7 +26,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from uwsfm.errors import InputError
-from uwsfm.rig_file import first_problem, read_yaml
+from uwsfm.rig_file import read_yaml
+from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]

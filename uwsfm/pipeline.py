@@ -1,7 +1,7 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
+from uwsfm.calibration.error_budget import BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
@@ -24,6 +25,7 @@ from uwsfm.export.files import (
 )
 from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
+    budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
@@ -196,6 +198,8 @@ class _Job:
         clock = time.perf_counter()
         arrays = start.arrays()
         refined = self._refined(start, arrays)
+        calibration, budget = with_budget(refined.calibration)
+        refined = replace(refined, calibration=calibration)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
         model = _model(self.rig, arrays, refined, out / WORK)
@@ -206,6 +210,8 @@ class _Job:
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
+        summary["warnings"] += housing_warnings(model.rig, calibration, budget)
+        summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
@@ -320,7 +326,6 @@ def _summary(
     cameras = housing_summary(model.rig, refined.calibration)
     warnings = mapped.pop("warnings")
     warnings += _images_without_points(model)
-    warnings += housing_warnings(model.rig, refined.calibration)
     del mapped["timings_s"]
     found = errors_summary(refined.calibration)
     after = found.pop("reprojection_rms_px")
@@ -358,9 +363,12 @@ def _images_without_points(model: Model) -> list[str]:
     ]
 
 
-def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
-    """What the images do not tell about the housings, one sentence each."""
-    warnings = list(verdicts(calibration, [camera.name for camera in rig.cameras]))
+def housing_warnings(
+    rig: Rig, calibration: CalibrationResult, budget: Sequence[BudgetRow] = ()
+) -> list[str]:
+    """What is not determined of the housings, one sentence each."""
+    names = [camera.name for camera in rig.cameras]
+    warnings = list(verdicts(calibration, names, budget))
     bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
     if bare:
         warnings.append(
@@ -403,3 +411,10 @@ def require_effect(options: CalibrateOptions) -> None:
     for name, (what, wanted) in refined.items():
         if getattr(options, name) is not None and not np.any(wanted):
             raise InputError(f"{name} has no effect: {what} is not refined")
+    lens = options.refine_focal, options.refine_principal_point
+    correlated = options.given is not None and options.given.correlated_prior
+    if correlated and not any((*lens, options.refine_distortion)):
+        raise InputError(
+            "accuracy.lens_prior: correlated has no effect: no lens parameter is "
+            "refined; add --refine focal, say, or leave this key out"
+        )

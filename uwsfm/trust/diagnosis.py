@@ -106,8 +106,9 @@ def options_of(calibration: CalibrationResult) -> dict[str, Any]:
     Another strategy or error than the joint one on pixels is left out: mistakes show in
     pixels.
     """
-    given, plain = asdict(calibration.options), asdict(CalibrateOptions())
-    return {name: given[name] for name in _KEPT if given[name] != plain[name]}
+    given, plain = calibration.options, CalibrateOptions()
+    pairs = ((name, getattr(given, name)) for name in _KEPT)
+    return {name: value for name, value in pairs if value != getattr(plain, name)}
 
 
 _KEPT = (

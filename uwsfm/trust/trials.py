@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.problem import CalibrateOptions
@@ -98,7 +99,7 @@ def adjusted(scene: Scene, rig: Rig, **options: Any) -> Fit | None:
         for damping, iterations in ROUNDS:
             settings = CalibrateOptions.parsed(
                 {
-                    **rig_options(rig),
+                    **rig_options(without_accuracy(rig)),
                     **options,
                     "initial_damping": damping,
                     "max_iterations": iterations,
@@ -126,6 +127,13 @@ def fit_of(scene: Scene, placement: Array) -> Fit:
         turn_deg=float(np.degrees(rigid3.rotation_angle(turns)).max()),
         swing_deg=float(np.degrees(swing).max(initial=0.0)),
     )
+
+
+def without_accuracy(rig: Rig) -> Rig:
+    """The rig with the accuracy that is assumed: a trial may exchange the lens or the
+    port that a stated one is of."""
+    cameras = tuple(replace(c, accuracy=CameraAccuracy()) for c in rig.cameras)
+    return replace(rig, cameras=cameras, accuracy=RigAccuracy())
 
 
 def _at_length(scene: Scene, placement: Array) -> Scene:
