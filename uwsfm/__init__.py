@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         make_map,
         mesh_cloud,
     )
+    from uwsfm.trust.verdict import Verdict, judge
 
 refuse_broken_zlib()
 
@@ -105,6 +106,8 @@ _HOMES = {
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
     "write_report": "uwsfm.report.files",
+    "Verdict": "uwsfm.trust.verdict",
+    "judge": "uwsfm.trust.verdict",
     "write_cloud": "uwsfm.cloud",
 }
 
@@ -126,6 +129,7 @@ __all__ = [
     "Scene",
     "Status",
     "UwsfmError",
+    "Verdict",
     "calibrate",
     "calibrate_housing",
     "clean_cloud",
@@ -139,6 +143,7 @@ __all__ = [
     "export_ply",
     "export_refractive_colmap",
     "export_scene_ply",
+    "judge",
     "load_rig",
     "make_map",
     "measure",

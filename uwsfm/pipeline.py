@@ -33,6 +33,7 @@ from uwsfm.export.summary import (
     scale_summary,
     versions,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import NoPort
@@ -59,6 +60,7 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
+from uwsfm.trust.verdict import Verdict, refined_verdict
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +74,8 @@ class ReconstructResult:
     """summary.json"""
     start: StartArrays
     """Where the mapper ended, before the refractive adjustment."""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def reconstruct(
@@ -202,9 +206,13 @@ class _Job:
         refined = replace(refined, calibration=calibration)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
+        self.progress("judging the fit", 0, None)
+        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
+        timings["judging the fit"] = time.perf_counter() - clock
+        clock, word = time.perf_counter(), verdict.verdict
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
-        export_housing(model.rig, out / HOUSING, refined.calibration)
+        export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
         export_given_rig(self.rig, out / RIG_GIVEN)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
@@ -213,6 +221,7 @@ class _Job:
         summary["warnings"] += housing_warnings(model.rig, calibration, budget)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
+        summary = with_verdict(verdict, summary)
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(
@@ -220,6 +229,7 @@ class _Job:
             calibration=refined.calibration,
             summary=summary,
             start=arrays,
+            verdict=verdict,
         )
 
     def _refined(self, start: Start, arrays: StartArrays) -> Refined:
