@@ -9,7 +9,8 @@ import yaml
 from command_line import one_sentence, run
 
 from uwsfm.check import CHECK, check_result, given_rig
-from uwsfm.console import console, explanations_table
+from uwsfm.cli_check import explanations_table
+from uwsfm.console import console
 from uwsfm.errors import InputError
 from uwsfm.export.files import RIG_GIVEN
 from uwsfm.trust.diagnosis import Explanation
@@ -70,7 +71,7 @@ def test_the_table_has_the_numbers_of_the_explanation():
         gain=83.0,
     )
     with console.capture() as captured:
-        console.print(explanations_table([one.to_json()]))
+        console.print(explanations_table([one]))
     text = captured.get()
     for words in ("port none", "1.59", "0.30", "Probably"):
         assert words in text

@@ -1,9 +1,17 @@
 """`uwsfm check`."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from uwsfm.trust.diagnosis import Explanation
 
 
 def check(
@@ -26,14 +34,31 @@ def check(
         from uwsfm.check import CHECK, check_result
 
         found = check_result(out, progress)
-    from uwsfm.console import console, explanations_table
+    from uwsfm.console import console, print_verdict
+    from uwsfm.export.files import read_summary
 
-    if found.verdict is not None:
-        console.print(f"verdict: {found.verdict}", markup=False)
-    for reason in found.reasons:
-        console.print(reason["text"], markup=False)
+    print_verdict({**(read_summary(out) or {}), "explanations": ()})
     if found.explanations:
-        console.print(explanations_table(one.to_json() for one in found.explanations))
+        console.print(explanations_table(found.explanations))
     else:
         console.print("No mistake explains the images better than the rig as given.")
     typer.echo(f"written: {out / CHECK}")
+
+
+def explanations_table(explanations: Iterable[Explanation]) -> Table:
+    """Mistakes that explain the images, each with its evidence."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title="Error of the best 90 % of the observations, RMS (px)",
+        title_justify="left",
+    )
+    table.add_column("mistake", no_wrap=True)
+    table.add_column("as given", justify="right", no_wrap=True)
+    table.add_column("without it", justify="right", no_wrap=True)
+    table.add_column("evidence and remedy")
+    for one in explanations:
+        before, after = f"{one.rms_before_px:.2f}", f"{one.rms_after_px:.2f}"
+        table.add_row(one.code.replace("_", " "), before, after, Text(one.text))
+    return table

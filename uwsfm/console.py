@@ -98,6 +98,8 @@ def print_verdict(summary: dict[str, Any]) -> None:
     for reason in summary.get("reasons", ()):
         line = Text(f"{reason['severity']}: {reason['text']}")
         console.print(Padding(line, (0, 0, 0, 2)))
+    for one in summary.get("explanations", ()):
+        console.print(Padding(Text(f"cause: {one['text']}"), (0, 0, 0, 2)))
 
 
 # Three numbers and their deviations side by side do not fit a narrow terminal.
@@ -312,22 +314,6 @@ def comparison_table(comparison: Comparison) -> Table:
     after, before = comparison.center_rms_m, comparison.start_center_rms_m
     table.add_row("rig centres (mm RMS)", "", "", "", f"{1e3 * after:.2f}")
     table.add_row("  before the end", "", "", "", f"{1e3 * before:.2f}")
-    return table
-
-
-def explanations_table(explanations: Iterable[dict[str, Any]]) -> Table:
-    """Mistakes that explain the images, each with its evidence."""
-    table = Table(
-        title="RMS of the best 90 % of the observations (px)", title_justify="left"
-    )
-    table.add_column("mistake", no_wrap=True)
-    table.add_column("as given", justify="right", no_wrap=True)
-    table.add_column("without it", justify="right", no_wrap=True)
-    table.add_column("evidence and remedy")
-    for one in explanations:
-        before, after = one["rms_before_px"], one["rms_after_px"]
-        code = one["code"].replace("_", " ")
-        table.add_row(code, f"{before:.2f}", f"{after:.2f}", Text(one["text"]))
     return table
 
 

@@ -49,6 +49,7 @@ from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.verdict import Verdict, judged, refined_verdict
 
@@ -248,6 +249,11 @@ class _Job:
             "versions": versions(),
         }
         summary = with_verdict(verdict, summary)
+        if self.start != "pairs":  # single pairs hold what most mistakes show in
+            causes = explain(
+                verdict.verdict, self.rig, calibration, progress=self.progress
+            )
+            summary["explanations"] = [one.to_json() for one in causes]
         export_housing(rig, self.out / HOUSING, calibration, verdict=verdict.verdict)
         write_json(summary, self.out / CALIBRATION)
         return HousingResult(

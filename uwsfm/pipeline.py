@@ -60,6 +60,7 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.verdict import Verdict, refined_verdict
 
 
@@ -222,6 +223,10 @@ class _Job:
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timings["looking for the cause"] = time.perf_counter() - clock
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(

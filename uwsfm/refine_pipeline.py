@@ -65,6 +65,7 @@ from uwsfm.sfm.refine import (
     rig_options,
     without_empty_frames,
 )
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.verdict import Verdict, refined_verdict
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
@@ -262,6 +263,10 @@ class _Job:
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timing["looking for the cause"] = time.perf_counter() - clock
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report
         )

@@ -27,6 +27,7 @@ from uwsfm.trust.midway import (
 )
 from uwsfm.trust.mistakes import Trial, length_trials, trials
 from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
+from uwsfm.trust.verdict import FITS
 
 UNIT = 0.02
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
@@ -88,13 +89,13 @@ def explain(
     """`diagnose`, where the verdict on a result is not that it fits.
 
     Args:
-        verdict: "fits" ends the matter.
+        verdict: See `uwsfm.trust.verdict`; that a result fits ends the matter.
         rig: As given.
         calibration: The result.
         frame_names: As of `diagnose`.
         progress: Called with each trial.
     """
-    if verdict == "fits":
+    if verdict == FITS:
         return ()
     scene, _ = calibration.scene.select(calibration.inliers)
     return diagnose(rig, scene, frame_names, progress, **options_of(calibration))
