@@ -32,6 +32,7 @@ COMMANDS = [
     ["refine"],
     ["demo"],
     ["batch"],
+    ["check"],
     ["clean"],
     ["color"],
     ["dense"],

@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from uwsfm import UwsfmError, calibrate
 from uwsfm.check_halves import check_halves
-from uwsfm.console import halves_table
+from uwsfm.cli import app
+from uwsfm.cli_check import halves_table
 from uwsfm.export.halves_summary import KEY, halves_numbers, with_cross_validation
 from uwsfm.export.summary import housing_summary, scale_summary
 from uwsfm.geometry import rigid3
@@ -208,6 +210,8 @@ def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
     before = json.loads((out / "summary.json").read_text())
     bare = {key: value for key, value in before.items() if key != KEY}
     (out / "summary.json").write_text(json.dumps(bare))
+    shown = CliRunner().invoke(app, ["check", str(out), "--halves"])
+    assert shown.exit_code == 0, shown.output
     numbers = check_halves(out)
     after = json.loads((out / "summary.json").read_text())
     assert after[KEY] == json.loads(json.dumps(numbers))

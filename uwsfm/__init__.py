@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         make_map,
         mesh_cloud,
     )
+    from uwsfm.trust.verdict import Verdict, judge
 
 refuse_broken_zlib()
 
@@ -110,6 +111,8 @@ _HOMES = {
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
     "write_report": "uwsfm.report.files",
+    "Verdict": "uwsfm.trust.verdict",
+    "judge": "uwsfm.trust.verdict",
     "write_cloud": "uwsfm.cloud",
 }
 
@@ -133,6 +136,7 @@ __all__ = [
     "StartOptions",
     "Status",
     "UwsfmError",
+    "Verdict",
     "calibrate",
     "calibrate_housing",
     "check_halves",
@@ -147,6 +151,7 @@ __all__ = [
     "export_ply",
     "export_refractive_colmap",
     "export_scene_ply",
+    "judge",
     "load_rig",
     "make_map",
     "measure",

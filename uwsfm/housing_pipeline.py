@@ -24,6 +24,7 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.pipeline import (
     WORK,
@@ -48,6 +49,9 @@ from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
+from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.goodness import Used
+from uwsfm.trust.verdict import Verdict, judged, refined_verdict
 
 Start = Literal["virtual", "paper", "pairs"]
 
@@ -64,6 +68,8 @@ class HousingResult:
     """What errors of the given numbers would do to it."""
     summary: dict[str, Any]
     """calibration.json"""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def calibrate_housing(
@@ -172,30 +178,41 @@ class _Job:
     def run(self, model: ModelStart | None) -> HousingResult:
         compiled(self.front_end.threads, self.progress)
         if self.start == "pairs":
-            calibration = self._from_pairs()
+            calibration, budget = with_budget(self._from_pairs())
+            count = calibration.scene.num_frames
+            seen = len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
+            used = Used(num_frames=count, num_registered=seen)
+            verdict = judged(self.rig, calibration, used)
         else:
             if model is None:
-                scene, names = self._from_images()
+                scene, names, num_frames = self._from_images()
             else:
                 scene, names = model.tracks.scene, model.tracks.frame_names
+                num_frames = len(names)
             if self.start == "paper":
                 scene = self._paper_start(scene)
             scene, lengths = self.known.placed(self.rig, names, scene)
             options = {"lengths": lengths, **self.options}
             # What is given is given of the rig file's ports, not of the map's.
             known = replace(scene, cameras=self.rig.refractive_cameras())
-            calibration = refine_scene(
+            refined = refine_scene(
                 scene, self.rig, self.progress, known=known, **options
-            ).calibration
-        return self._finish(calibration, () if model is None else model.warnings)
+            )
+            calibration, budget = with_budget(refined.calibration)
+            refined = replace(refined, calibration=calibration)
+            self.progress("judging the fit", 0, None)
+            verdict = refined_verdict(self.rig, refined, num_frames)
+        notes = () if model is None else model.warnings
+        return self._finish(calibration, budget, verdict, notes)
 
-    def _from_images(self) -> tuple[Scene, Sequence[str]]:
-        """The start, and the names of its frames."""
+    def _from_images(self) -> tuple[Scene, Sequence[str], int]:
+        """The start, the names of its frames, and how many frames there were."""
         start = perspective_start(
             self.rig, self.source, self.out / WORK, self.front_end, self.progress
         )
         arrays = start.arrays()
-        return start_scene(self.rig, start, arrays), arrays.frame_names
+        scene = start_scene(self.rig, start, arrays)
+        return scene, arrays.frame_names, start.summary["num_frames"]
 
     def _paper_start(self, scene: Scene) -> Scene:
         """Poses from pinholes, by what the calibrations in air reached: section 3.2.2.
@@ -235,11 +252,14 @@ class _Job:
         ]
 
     def _finish(
-        self, calibration: CalibrationResult, notes: Sequence[str]
+        self,
+        calibration: CalibrationResult,
+        budget: tuple[BudgetRow, ...],
+        verdict: Verdict,
+        notes: Sequence[str],
     ) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
         rig = refined_rig(self.rig, scene)
-        calibration, budget = with_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,
@@ -255,10 +275,20 @@ class _Job:
             "error_budget": budget_summary(budget),
             "versions": versions(),
         }
-        export_housing(rig, self.out / HOUSING, calibration)
+        summary = with_verdict(verdict, summary)
+        if self.start != "pairs":  # single pairs hold what most mistakes show in
+            causes = explain(
+                verdict.verdict, self.rig, calibration, progress=self.progress
+            )
+            summary["explanations"] = [one.to_json() for one in causes]
+        export_housing(rig, self.out / HOUSING, calibration, verdict=verdict.verdict)
         write_json(summary, self.out / CALIBRATION)
         return HousingResult(
-            rig=rig, calibration=calibration, budget=budget, summary=summary
+            rig=rig,
+            calibration=calibration,
+            budget=budget,
+            summary=summary,
+            verdict=verdict,
         )
 
 

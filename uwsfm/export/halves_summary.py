@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.errors import UwsfmError
+from uwsfm.export.verdict_summary import plain
 from uwsfm.rig import Rig
 from uwsfm.trust.halves import (
     CrossValidation,
@@ -88,8 +87,8 @@ def _enlarge(entry: dict[str, Any], name: str, unit: str, factor: float) -> None
     if entry.get(in_all) is not None:
         total = np.asarray(entry[in_all], dtype=np.float64)
         added = np.maximum(total**2 - stddev**2, 0.0)
-        entry[in_all] = _plain(np.sqrt(added + (factor * stddev) ** 2))
-    entry[own] = _plain(factor * stddev)
+        entry[in_all] = plain(np.sqrt(added + (factor * stddev) ** 2).tolist())
+    entry[own] = plain((factor * stddev).tolist())
 
 
 def halves_numbers(found: CrossValidation) -> dict[str, Any]:
@@ -127,11 +126,11 @@ def _split_numbers(split: Split) -> dict[str, Any]:
         "agreements": [vars(agreement) for agreement in split.agreements],
         "lengths": None if split.lengths is None else vars(split.lengths),
         "projections": {
-            "ranges_m": _plain(maps.ranges_m),
+            "ranges_m": plain(maps.ranges_m),
             "rms_px": [maps.rms_px(r) for r in ranges],
             "rms_mm": [maps.rms_mm(r) for r in ranges],
-            "px": _plain(maps.px),
-            "mm": _plain(maps.mm),
+            "px": plain(maps.px),
+            "mm": plain(maps.mm),
         },
     }
 
@@ -160,11 +159,3 @@ def halves_sentences(found: CrossValidation) -> list[str]:
             "The halves differ by no more than their standard deviations predict."
         )
     return [*lines, *found.omitted]
-
-
-def _plain(values: ArrayLike) -> Any:
-    """Nested lists or a number, null where it is not finite."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0:
-        return float(array) if math.isfinite(array) else None
-    return [_plain(value) for value in array]

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm.report.gather import Report, plain
+from uwsfm.export.verdict_summary import plain
+from uwsfm.report.gather import Report
 from uwsfm.report.halves import halves_of, halves_payload
-from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
 from uwsfm.report.tables import budget_columns, budget_lines
 from uwsfm.report.words import deviation, known_length_rows, position_words
+from uwsfm.trust.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.trust.verdict import LENS_SHARE
 
 _BADGES = {
     "determined": "good",
@@ -24,9 +26,11 @@ _BADGES = {
     "not determined": "bad",
     "arbitrary": "bad",
     "ran into zero": "bad",
+    "fits": "good",
+    "doubtful": "weak",
+    "does not fit": "bad",
+    "withheld": "bad",
 }
-LENS_SHARE = 0.7
-"""Of systematic residuals: if less is left with a free lens, it was the lens."""
 _SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
 """A shape beside the word: colour alone tells nothing to many."""
 

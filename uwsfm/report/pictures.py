@@ -11,7 +11,7 @@ import numpy as np
 from uwsfm.report.gather import Report
 from uwsfm.report.halves import halves_payload
 from uwsfm.report.page import Scales, cost_unit, scales_of
-from uwsfm.report.residuals import CameraResiduals, Profile, Residuals
+from uwsfm.trust.residuals import CameraResiduals, Profile, Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
