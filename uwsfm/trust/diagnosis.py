@@ -19,6 +19,7 @@ from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResul
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
+from uwsfm.solver.threads import limited
 from uwsfm.trust.midway import (
     coarse_firsts,
     fine_firsts,
@@ -180,7 +181,8 @@ class _Experiments:
     def tried(self, trial: Trial, part: Scene) -> Tried | None:
         self.done += 1
         self.progress("looking for the cause", self.done, None)
-        fit = trial.fit(part, self.options)
+        with limited(1):  # a few hundred points are not worth a second thread
+            fit = trial.fit(part, self.options)
         if fit is None:
             return None
         return Tried(trial, fit, strain_of(trial.rig, fit) + trial.handicap)
