@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -74,9 +75,14 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
         ("resolution", _resolutions),
         ("principal_point", _centers),
     )
-    for code, variants in kinds:
-        applies = _distorts if code in _OF_DISTORTION else lambda _: True
-        for which in subsets(rig, applies):
+    models = dict.fromkeys(item.camera.model_name for item in rig.cameras)
+    for model, (code, variants) in product(models, kinds):
+
+        def concerns(item: RigCamera, model: str = model, code: str = code) -> bool:
+            named = item.camera.model_name == model  # its numbers mean the same
+            return named and (code not in _OF_DISTORTION or _distorts(item))
+
+        for which in subsets(rig, concerns):
             for what, remedy, change in variants(rig.cameras[which[0]]):
                 other = _changed(rig, which, change)
                 if other is None:
