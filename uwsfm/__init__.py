@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
+    from uwsfm.check_halves import check_halves
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
     from uwsfm.color.commands import correct_colors
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
+    from uwsfm.sfm.options import MatchOptions, StartOptions
     from uwsfm.sfm.refractive_colmap import (
         read_refractive_colmap,
         rig_of_refractive_colmap,
@@ -77,6 +79,7 @@ _HOMES = {
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
     "calibrate_housing": "uwsfm.housing_pipeline",
+    "check_halves": "uwsfm.check_halves",
     "clean_cloud": "uwsfm.surface.commands",
     "correct_colors": "uwsfm.color.commands",
     "error_budget": "uwsfm.calibration.error_budget",
@@ -102,6 +105,8 @@ _HOMES = {
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "Result": "uwsfm.result_folder",
     "open_result": "uwsfm.result_folder",
+    "MatchOptions": "uwsfm.sfm.options",
+    "StartOptions": "uwsfm.sfm.options",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
@@ -120,6 +125,7 @@ __all__ = [
     "FlatPort",
     "InputError",
     "Lengths",
+    "MatchOptions",
     "Model",
     "NoPort",
     "Positions",
@@ -127,11 +133,13 @@ __all__ = [
     "Result",
     "Rig",
     "Scene",
+    "StartOptions",
     "Status",
     "UwsfmError",
     "Verdict",
     "calibrate",
     "calibrate_housing",
+    "check_halves",
     "clean_cloud",
     "correct_colors",
     "dense_cloud",

@@ -13,6 +13,7 @@ import typer
 
 from uwsfm import _signals
 from uwsfm.cli_batch import batch
+from uwsfm.cli_check import check
 from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
 from uwsfm.cli_measure import measure
@@ -54,6 +55,7 @@ app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
+app.command()(check)
 app.command()(dense)
 app.command()(measure)
 app.command()(clean)
@@ -240,6 +242,16 @@ def calibrate(
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     matcher: MatcherOption = "colmap",
+    fundamental_max_error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PIXELS",
+            help="Tolerance of the fundamental matrix of --matcher paper, in raw "
+            "pixels; default: a hundredth of the image's longer side.",
+            show_default=False,
+        ),
+    ] = None,
+    mapper: MapperOption = "pinhole",
     max_features: MaxFeaturesOption = None,
     scene_distance: SceneDistanceOption = None,
     seed: SeedOption = 0,
@@ -252,9 +264,13 @@ def calibrate(
         from uwsfm.housing_pipeline import calibrate_housing
         from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
+        matching = MatchOptions(
+            matcher=matcher, fundamental_max_error_px=fundamental_max_error
+        )
         front_end = StartOptions(
             features=FeatureOptions(max_num_features=max_features),
-            matching=MatchOptions(matcher=matcher),
+            matching=matching,
+            mapper=mapper,
             seed=seed,
             num_threads=threads,
         )

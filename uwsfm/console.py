@@ -98,6 +98,8 @@ def print_verdict(summary: dict[str, Any]) -> None:
     for reason in summary.get("reasons", ()):
         line = Text(f"{reason['severity']}: {reason['text']}")
         console.print(Padding(line, (0, 0, 0, 2)))
+    for one in summary.get("explanations", ()):
+        console.print(Padding(Text(f"cause: {one['text']}"), (0, 0, 0, 2)))
 
 
 # Three numbers and their deviations side by side do not fit a narrow terminal.

@@ -18,11 +18,13 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
     export_ply,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.halves_summary import with_halves
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -59,6 +61,7 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.verdict import Verdict, refined_verdict
 
 
@@ -212,6 +215,7 @@ class _Job:
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
         export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
+        export_given_rig(self.rig, out / RIG_GIVEN)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
@@ -219,7 +223,12 @@ class _Job:
         summary["warnings"] += housing_warnings(model.rig, calibration, budget)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, calibration)
         summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timings["looking for the cause"] = time.perf_counter() - clock
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(

@@ -17,10 +17,12 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.halves_summary import with_halves
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -64,6 +66,7 @@ from uwsfm.sfm.refine import (
     rig_options,
     without_empty_frames,
 )
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.verdict import Verdict, refined_verdict
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
@@ -252,6 +255,7 @@ class _Job:
         clock, word = clock + timing["judging the fit"], verdict.verdict
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, calibration, verdict=word)
+        export_given_rig(self.rig, self.out / RIG_GIVEN)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
@@ -259,7 +263,12 @@ class _Job:
         summary["warnings"] += housing_warnings(model.rig, calibration, budget)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, calibration)
         summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timing["looking for the cause"] = time.perf_counter() - clock
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report
         )

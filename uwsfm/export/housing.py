@@ -14,6 +14,7 @@ from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
 from uwsfm.trust.verdict import FITS
 
+GIVEN = """The rig as given for this result, before anything was refined."""
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
 Standard deviations are one sigma; normals are unit vectors from camera to water.
 "estimated" lets it hold what no person would type; "accuracy" is in all."""
@@ -80,6 +81,11 @@ def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
         }
         cameras.append(replace(camera, accuracy=replace(camera.accuracy, **digits)))
     return replace(rig, cameras=tuple(cameras))
+
+
+def export_given_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig as it was given, for `uwsfm check` to find the mistake in it."""
+    dump_rig(rig, path, GIVEN, {})
 
 
 def _comments(

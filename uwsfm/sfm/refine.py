@@ -195,11 +195,11 @@ def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
 
 def within_valid_radius(scene: Scene, rig: Rig) -> NDArray[np.bool_]:
     """Mask (N,) of the observations that the calibrations in air covered."""
-    radii = [c.valid_radius_px for c in rig.cameras]
-    limits = np.array([np.inf if radius is None else radius for radius in radii])
-    centers = np.array([camera.lens[2:4] for camera in scene.cameras])
-    offset = scene.xy - centers[scene.camera_idx]
-    return np.linalg.norm(offset, axis=1) <= limits[scene.camera_idx]
+    covered = np.ones(scene.num_observations, dtype=bool)
+    for index, camera in enumerate(rig.cameras):
+        rows = scene.camera_idx == index
+        covered[rows] = camera.covers(scene.xy[rows])
+    return covered
 
 
 def retriangulated(scene: Scene, trusted: NDArray[np.bool_]) -> Scene:
