@@ -107,9 +107,8 @@ def free_lens(calibration: CalibrationResult) -> FreeLens | None:
 def _saved(before: Scene, after: Scene) -> Array:
     """Squares saved at each point (P,), px^2."""
     saved = np.sum(before.residuals() ** 2 - after.residuals() ** 2, axis=1)
-    of_point: Array = np.bincount(
-        before.point_idx, np.nan_to_num(saved), minlength=before.num_points
-    )
+    of_point = np.zeros(before.num_points)
+    np.add.at(of_point, before.point_idx, np.nan_to_num(saved))
     return of_point
 
 
