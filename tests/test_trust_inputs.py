@@ -64,7 +64,7 @@ def test_every_mistake_changes_its_dive_and_repeats(mistake, flat, domes):
         assert rows[:, 0].max() < len(wrong.keypoints[a])
         assert rows[:, 1].max() < len(wrong.keypoints[b])
         assert a[1] < wrong.num_frames and b[1] < wrong.num_frames
-    assert len(wrong.rig_from_world) == wrong.num_frames
+    assert wrong.keypoints.keys() == set(wrong.images) == wrong.taken.keys()
 
 
 def test_there_are_forty_kinds_with_names_of_their_own():
@@ -142,7 +142,7 @@ def test_matches_follow_their_images_into_the_database(flat, tmp_path):
         wrong.frames(tmp_path),
         wrong.rig,
         wrong.true_rig,
-        wrong.rig_from_world,
+        wrong.true_poses,
     )
     assert same_input(replace(again, rig=wrong.rig), rounded(wrong))
 

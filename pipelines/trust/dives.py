@@ -40,12 +40,16 @@ class Dive:
     rig: Rig
     """As its user wrote it down."""
     true_rig: Rig
-    rig_from_world: Array
-    """(F, 7) true ones; of the reference camera."""
+    true_poses: Array
+    """(F', 7) rig_from_world of all frames that were taken."""
     names: tuple[str, ...]
     """Of the frames (F)."""
     keypoints: dict[ImageKey, Array]
     """(K, 2) pixels, COLMAP's origin."""
+    seen: dict[ImageKey, Array]
+    """(K, 2) where the same keypoints were in the image as it was taken."""
+    taken: dict[ImageKey, ImageKey]
+    """Which camera took an image, in which frame of ``true_poses``."""
     matches: dict[tuple[ImageKey, ImageKey], IndexArray]
     """(M, 2) keypoints of the one image and of the other."""
 
@@ -173,9 +177,11 @@ def read_dive(
     return Dive(
         rig=rig,
         true_rig=true_rig,
-        rig_from_world=np.asarray(rig_from_world, dtype=np.float64),
+        true_poses=np.asarray(rig_from_world, dtype=np.float64),
         names=frames.names,
         keypoints=keypoints,
+        seen=keypoints,
+        taken={key: key for key in images},
         matches=matches,
     )
 
@@ -190,15 +196,16 @@ def with_keypoints_moved(
         move: Gives the new pixels (K, 2) of camera and frame; not finite: lost.
         cameras: Whose images change.
     """
-    moved, kept = {}, {}
+    moved, seen, kept = {}, {}, {}
     for (c, f), xy in dive.keypoints.items():
         new = move(c, f, xy) if c in cameras else xy
         lens = dive.rig.cameras[c].camera
         with np.errstate(invalid="ignore"):
             inside = (new >= 0.0) & (new <= [lens.width, lens.height])
         keep = inside.all(axis=1) if c in cameras else np.ones(len(xy), dtype=bool)
-        moved[c, f], kept[c, f] = new[keep], keep
-    return replace(dive, keypoints=moved, matches=_matches_of(dive, kept))
+        moved[c, f], seen[c, f] = new[keep], dive.seen[c, f][keep]
+        kept[c, f] = keep
+    return replace(dive, keypoints=moved, seen=seen, matches=_matches_of(dive, kept))
 
 
 def _matches_of(
@@ -226,29 +233,29 @@ def with_frames_of(dive: Dive, camera: int, source: IndexArray) -> Dive:
             the frame is lost.
     """
     used = np.flatnonzero(source >= 0)
-    # Where image (c, f) is now: the frame's new number.
-    place: dict[ImageKey, int] = {}
+    place: dict[ImageKey, ImageKey] = {}
     for new, f in enumerate(used.tolist()):
         for c in range(len(dive.rig.cameras)):
-            place[c, int(source[f]) if c == camera else f] = new
+            place[c, int(source[f]) if c == camera else f] = (c, new)
+    names = tuple(dive.names[f] for f in used)
+    return renamed(replace(dive, names=names), place)
+
+
+def renamed(dive: Dive, place: dict[ImageKey, ImageKey]) -> Dive:
+    """Images as those of other cameras and frames; those without a place are lost."""
     matches: dict[tuple[ImageKey, ImageKey], IndexArray] = {}
     for (a, b), rows in dive.matches.items():
-        if a in place and b in place:
-            first, second = (a[0], place[a]), (b[0], place[b])
-            key = (first, second)
-            if (second[1], second[0]) < (first[1], first[0]):
-                key, rows = (second, first), rows[:, ::-1]
-            matches[key] = rows
-    poses = dive.rig_from_world[source[used] if camera == 0 else used]
+        if a not in place or b not in place:
+            continue
+        first, second = place[a], place[b]
+        if second[::-1] < first[::-1]:  # frame by frame, as the database has them
+            first, second, rows = second, first, rows[:, ::-1]
+        matches[first, second] = rows
     return replace(
         dive,
-        rig_from_world=poses,
-        names=tuple(dive.names[f] for f in used),
-        keypoints={
-            (c, place[c, f]): xy
-            for (c, f), xy in dive.keypoints.items()
-            if (c, f) in place
-        },
+        keypoints={new: dive.keypoints[old] for old, new in place.items()},
+        seen={new: dive.seen[old] for old, new in place.items()},
+        taken={new: dive.taken[old] for old, new in place.items()},
         matches=matches,
     )
 

@@ -12,7 +12,7 @@ from zlib import crc32
 
 import numpy as np
 import pycolmap
-from dives import Dive, with_frames_of, with_keypoints_moved
+from dives import Dive, renamed, with_frames_of, with_keypoints_moved
 from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
@@ -346,20 +346,7 @@ def mirrored(cameras: tuple[int, ...], axis: int) -> Change:
 def _folders_swapped(dive: Dive, rng: np.random.Generator) -> Dive:
     """The folder of the left camera is that of the right one."""
     del rng
-    poses = rigid3.compose(known_cam_from_rig(dive.true_rig)[1], dive.rig_from_world)
-    matches = {}
-    for (a, b), rows in dive.matches.items():
-        first, second = (1 - a[0], a[1]), (1 - b[0], b[1])
-        key = (first, second)
-        if (second[1], second[0]) < (first[1], first[0]):
-            key, rows = (second, first), rows[:, ::-1]
-        matches[key] = rows
-    return replace(
-        dive,
-        rig_from_world=poses,
-        keypoints={(1 - c, f): xy for (c, f), xy in dive.keypoints.items()},
-        matches=matches,
-    )
+    return renamed(dive, {(c, f): (1 - c, f) for c, f in dive.images})
 
 
 def _late(camera: int, shift: int, from_frame: tuple[float, float] | None) -> Change:

@@ -1,0 +1,280 @@
+"""What becomes of an input: refused, or a result with a verdict; against the truth."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from assessment import assessed
+from dives import Dive
+from scipy.spatial.distance import pdist
+
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.propagation import Propagation
+from uwsfm.errors import UwsfmError
+from uwsfm.export.summary import housing_summary, scale_summary
+from uwsfm.geometry.rays import finite_rows
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.geometry.unit_vector import angle_between
+from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.pipeline import refined_rig, start_scene
+from uwsfm.rig import Rig
+from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.perspective import StartArrays
+from uwsfm.sfm.refine import Refined, refine_scene, retriangulated
+from uwsfm.sfm.start import start_from_matches
+from uwsfm.sfm.steps import Steps
+from uwsfm.simulate.rigs import known_cam_from_rig
+
+REFUSED, FITS = "refused", "fits"
+LIMIT = 3.0
+"""Printed standard deviations; an error beyond them must not come with "fits"."""
+NUM_LENGTHS = 5
+"""Long distances between points that are compared."""
+REFUSALS = {
+    "folders_swapped": r"folders? .* swapped",
+    "pose_inverted": r"inverted",
+    "translation_sign": r"position of the camera",
+    "port_missing": r"port of .* missing",
+    "quaternion_order": r"order x, y, z, w|quaternion",
+    "rotation_transposed": r"transposed",
+    "frames_shifted": r"frames? (late|shifted)|taken (together|at the same time)",
+    "mirrored": r"mirror",
+    "length_unit": r"did you mean|in metres|millimetre|unit",
+    "water_index": r"water index|index of (the )?(water|air)|refractive_index",
+    "resolution": r"resolution|image size|puts the principal point outside",
+    "port_none": r"calibrated in the water, though|port: none",
+    "undistorted": r"undistorted",
+    "fisheye": r"fisheye",
+    "focal": r"focal length",
+    "principal_point": r"principal point",
+    "distortion_sign": r"sign of the distortion|distortion .* sign",
+    "distortion_order": r"order of the distortion|distortion .* order",
+}
+"""Causes that a refusal names, by what it says of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """One input, run."""
+
+    verdict: str
+    """"refused", or what the verdict is."""
+    words: str
+    """Of the refusal, or the first reason."""
+    causes: tuple[str, ...] = ()
+    """Codes of the causes that are named, the likeliest first."""
+    errors: dict[str, float] = field(default_factory=dict)
+    """Each error against the truth in its printed standard deviations."""
+    z_scores: dict[str, float] = field(default_factory=dict)
+    """The signed ones, where the sign means something."""
+    num_frames: int = 0
+    num_observations: int = 0
+    rms_px: float | None = None
+    seconds: float = 0.0
+
+    @property
+    def worst(self) -> float:
+        return max(self.errors.values(), default=0.0)
+
+    @property
+    def confidently_wrong(self) -> bool:
+        return self.verdict == FITS and self.worst > LIMIT
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
+    """Run the steps of ``uwsfm reconstruct`` from the matches on, and judge them.
+
+    Args:
+        dive: What is given: its rig goes through a rig file, with all checks of it.
+        diagnosed: Look for the cause where the verdict is not that it fits.
+    """
+    clock = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        try:
+            dump_rig(dive.rig, work / "rig.yaml")
+            rig = load_rig(work / "rig.yaml")
+            dive.write_database(work / "database.db")
+            frames = dive.frames(work)
+            start = start_from_matches(rig, frames, Steps(work), "", StartOptions())
+            arrays = start.arrays()
+            refined = refine_scene(start_scene(rig, start, arrays), rig)
+        except UwsfmError as error:
+            text = str(error).replace(str(work), "OUT")
+            return Outcome(
+                verdict=REFUSED,
+                words=text,
+                causes=causes_in(text),
+                seconds=time.perf_counter() - clock,
+            )
+        found = assessed(rig, start, refined, work, diagnosed=diagnosed)
+    true_points = points_of_truth(dive, arrays, refined)
+    errors, z_scores = errors_of(rig, refined, dive.true_rig, true_points)
+    return Outcome(
+        verdict=found.verdict,
+        words=found.words,
+        causes=found.causes,
+        errors=errors,
+        z_scores=z_scores,
+        num_frames=refined.scene.num_frames,
+        num_observations=refined.scene.num_observations,
+        rms_px=refined.calibration.summary.rms_px,
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def causes_in(text: str) -> tuple[str, ...]:
+    """Codes of the causes that a sentence names, in the order of its words."""
+    places = {
+        code: match.start()
+        for code, pattern in REFUSALS.items()
+        if (match := re.search(pattern, text))
+    }
+    return tuple(sorted(places, key=lambda code: places[code]))
+
+
+def errors_of(
+    rig: Rig, refined: Refined, true_rig: Rig, true_points: Array
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Errors over printed standard deviations: sizes of all, and signed z-scores.
+
+    Args:
+        rig: That was given.
+        refined: The result.
+        true_rig: The truth.
+        true_points: (P, 3), see `points_of_truth`.
+    """
+    calibration, scene = refined.calibration, refined.scene
+    errors: dict[str, float] = {}
+    z_scores: dict[str, float] = {}
+    entries = housing_summary(refined_rig(rig, scene), calibration)
+    stddev = scale_summary(calibration)["relative_stddev"]
+    for entry, port, item in zip(entries, scene.ports, true_rig.cameras, strict=True):
+        scores, sizes = _port_scores(entry, port, item.port)
+        if stddev is None:  # lengths in an arbitrary unit cannot be wrong
+            scores = {k: v for k, v in scores.items() if "tilt" in k}
+        z_scores |= scores
+        errors |= sizes
+    if stddev is not None and calibration.covariance.determined:
+        rows = well_seen(scene, true_points)
+        scale = relative_size(scene.points[rows], true_points[rows]) - 1.0
+        z_scores["scale"] = _over(scale, stddev)
+        errors["length"] = worst_length(calibration, true_points, rows)
+    errors |= {n: abs(z) for n, z in z_scores.items() if "tilt" not in n}
+    return errors, z_scores
+
+
+def _port_scores(
+    entry: dict[str, Any], port: Port, true: Port
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Signed z-scores of what a port has, and sizes of what has no sign."""
+    name = entry["name"]
+    if type(port) is not type(true):
+        other = {} if isinstance(port, NoPort) else {f"{name} port": np.inf}
+        return {}, other
+    scores: dict[str, float] = {}
+    if isinstance(port, FlatPort) and isinstance(true, FlatPort):
+        if entry["distance_stddev_m"] is not None:
+            miss = port.distance - true.distance
+            scores[f"{name} distance"] = _over(miss, entry["distance_stddev_m"])
+        stddev = entry["normal_stddev_deg"]
+        if stddev is None:
+            return scores, {}
+        for i, axis in enumerate("xy"):  # each has half of the mean square angle
+            miss = float(np.degrees(port.normal[i] - true.normal[i]))
+            scores[f"{name} tilt {axis}"] = _over(miss, stddev / np.sqrt(2.0))
+        angle = float(np.degrees(angle_between(port.normal, true.normal)))
+        return scores, {f"{name} tilt": _over(angle, stddev)}
+    if isinstance(port, DomePort) and isinstance(true, DomePort):
+        for i, axis in enumerate("xyz"):
+            stddev = entry["center_stddev_m"][i]
+            if stddev is not None:
+                miss = port.center[i] - true.center[i]
+                scores[f"{name} centre {axis}"] = _over(miss, stddev)
+    return scores, {}
+
+
+def _over(miss: float, stddev: float) -> float:
+    return float(miss / stddev) if stddev > 0.0 else float(np.sign(miss) * np.inf)
+
+
+def points_of_truth(dive: Dive, arrays: StartArrays, refined: Refined) -> Array:
+    """Where the points of a result really are (P, 3).
+
+    Intersected with the true rig, at the true poses, from the observations that the
+    result has, where they were in the images as they were taken.
+    """
+    scene, keypoint_idx = refined.scene, arrays.keypoint_idx[refined.kept]
+    frame_of = [dive.names.index(name) for name in arrays.frame_names]
+    camera_idx = np.empty_like(scene.camera_idx)
+    frame_idx, xy = np.empty_like(scene.frame_idx), np.empty_like(scene.xy)
+    for c in range(len(scene.cameras)):
+        for f, original in enumerate(frame_of):
+            rows = (scene.camera_idx == c) & (scene.frame_idx == f)
+            camera_idx[rows], frame_idx[rows] = dive.taken[c, original]
+            xy[rows] = dive.seen[c, original][keypoint_idx[rows]]
+    true = Scene.from_arrays(
+        cameras=dive.true_rig.refractive_cameras(),
+        cam_from_rig=known_cam_from_rig(dive.true_rig),
+        rig_from_world=dive.true_poses,
+        points=scene.points,
+        camera_idx=camera_idx,
+        frame_idx=frame_idx,
+        point_idx=scene.point_idx,
+        xy=xy,
+    )
+    return retriangulated(true, np.ones(len(xy), dtype=bool)).points
+
+
+def well_seen(scene: Scene, true_points: Array) -> IndexArray:
+    """The points with the most observations: wrong matches are rare among them."""
+    counts = np.bincount(scene.point_idx, minlength=scene.num_points)
+    good = finite_rows(scene.points) & finite_rows(true_points)
+    enough = np.percentile(counts[good], 60.0)
+    return np.flatnonzero(good & (counts >= enough))
+
+
+def relative_size(points: Array, true_points: Array) -> float:
+    """The factor that fits all distances between points (n, 3) best."""
+    rows = np.linspace(0, len(points) - 1, min(len(points), 300)).astype(np.int64)
+    estimate, true = pdist(points[rows]), pdist(true_points[rows])
+    # By medians: a wrong match is no matter of scale.
+    long = true >= np.median(true)
+    return float(np.median(estimate[long] / true[long]))
+
+
+def worst_length(
+    calibration: CalibrationResult, true_points: Array, rows: IndexArray
+) -> float:
+    """Greatest error of some long distances between points, in what is printed as ±.
+
+    As ``uwsfm measure`` does, the larger of two deviations is taken.
+    """
+    points, propagation = calibration.scene.points, Propagation(calibration)
+    rng = np.random.default_rng(0)
+    pairs = rng.choice(rows, size=(200, 2))
+    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    worst = 0.0
+    for a, b in pairs[np.argsort(-apart)[:NUM_LENGTHS]]:
+        step = points[a] - points[b]
+        length = float(np.linalg.norm(step))
+        places = propagation.of_points(np.array([a, b]))
+        slopes = np.stack([step, -step])[None] / length
+        stddev = max(
+            float(np.sqrt(np.ravel(cov(places, slopes))[0]))
+            for cov in (propagation.covariance, propagation.clustered_covariance)
+        )
+        miss = length - float(np.linalg.norm(true_points[a] - true_points[b]))
+        worst = max(worst, _over(abs(miss), stddev))
+    return worst
