@@ -118,7 +118,8 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
                 causes=causes_in(text),
                 seconds=time.perf_counter() - clock,
             )
-        found = assessed(rig, start, refined, work, diagnosed=diagnosed)
+        num_frames = len(frames.names)
+        found = assessed(rig, refined, num_frames, diagnosed=diagnosed)
     true_points = points_of_truth(dive, arrays, refined)
     errors, z_scores = errors_of(rig, refined, dive.true_rig, true_points)
     return Outcome(

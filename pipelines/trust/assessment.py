@@ -1,0 +1,43 @@
+"""The verdict on a result and the causes that are named, as the jobs come by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from uwsfm.pipeline import refined_verdict
+from uwsfm.rig import Rig
+from uwsfm.sfm.refine import Refined
+from uwsfm.trust.diagnosis import diagnose
+from uwsfm.trust.verdict import FITS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assessment:
+    """What a person is shown first."""
+
+    verdict: str
+    words: str
+    """The reasons, and the causes in words."""
+    causes: tuple[str, ...]
+    """Codes, the likeliest first."""
+
+
+def assessed(
+    rig: Rig, refined: Refined, num_frames: int, *, diagnosed: bool
+) -> Assessment:
+    """Judge a result; where it does not simply fit, look for the cause.
+
+    Args:
+        rig: As given.
+        refined: The result.
+        num_frames: That there were, registered or not.
+        diagnosed: False: look for no cause, which takes some seconds.
+    """
+    verdict = refined_verdict(rig, refined, num_frames)
+    reasons = [f"{reason.code}: {reason.text}" for reason in verdict.reasons]
+    causes: tuple[str, ...] = ()
+    if diagnosed and verdict.verdict != FITS:
+        found = diagnose(rig, refined.scene)
+        causes = tuple(one.code for one in found)
+        reasons += [one.text for one in found]
+    return Assessment(verdict=verdict.verdict, words=" ".join(reasons), causes=causes)
