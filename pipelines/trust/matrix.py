@@ -16,7 +16,7 @@ from typing import Any
 
 from dives import Dive, simulated_dive
 from images import rendered_dive
-from outcomes import FITS, REFUSED, Outcome, outcome_of
+from outcomes import FITS, REFUSED, Outcome, causes_in, outcome_of
 from wrong_inputs import MISTAKES, Mistake
 
 from uwsfm._files import replaced_file
@@ -42,7 +42,8 @@ class Case:
         try:
             wrong = mistake.applied(self.right(mistake), self.trial)
         except UwsfmError as error:  # the rig file cannot hold such numbers
-            outcome = Outcome(verdict=REFUSED, words=str(error))
+            text = str(error)
+            outcome = Outcome(verdict=REFUSED, words=text, causes=causes_in(text))
         else:
             outcome = outcome_of(wrong)
         return {

@@ -38,27 +38,36 @@ LIMIT = 3.0
 """Printed standard deviations; an error beyond them must not come with "fits"."""
 NUM_LENGTHS = 5
 """Long distances between points that are compared."""
-REFUSALS = {
-    "folders_swapped": r"folders? .* swapped",
+NAMED = {
+    "port_none": r"was calibrated in the water(?!, not)",
+    "port_missing": r"port of .* is missing",
+    "undistorted": r"undistorted already",
+    "rotation_transposed": r"rotation of .* transposed",
     "pose_inverted": r"inverted",
-    "translation_sign": r"position of the camera",
-    "port_missing": r"port of .* missing",
-    "quaternion_order": r"order x, y, z, w|quaternion",
-    "rotation_transposed": r"transposed",
-    "frames_shifted": r"frames? (late|shifted)|taken (together|at the same time)",
-    "mirrored": r"mirror",
-    "length_unit": r"did you mean|in metres|millimetre|unit",
-    "water_index": r"water index|index of (the )?(water|air)|refractive_index",
-    "resolution": r"resolution|image size|puts the principal point outside",
-    "port_none": r"calibrated in the water, though|port: none",
-    "undistorted": r"undistorted",
-    "fisheye": r"fisheye",
-    "focal": r"focal length",
-    "principal_point": r"principal point",
-    "distortion_sign": r"sign of the distortion|distortion .* sign",
-    "distortion_order": r"order of the distortion|distortion .* order",
+    "translation_sign": r"is the position of the camera|sign of (the )?translation",
+    "quaternion_order": r"quaternion|w, x, y, z",
+    "principal_point": r"principal point of",
+    "focal": r"focal length of",
+    "resolution": r"another resolution",
+    "distortion_order": r"distortion of .* read as",
+    "distortion_sign": r"distortion of .* sign changed",
+    "fisheye": r"as (OPENCV|OPENCV_FISHEYE) with the same numbers",
+    "dome_as_flat": r"a dome in place of",
+    "flat_as_dome": r"a flat port in place of",
+    "folders_swapped": r"folders .* are swapped",
+    "mirrored": r"mirrored",
+    "frames_shifted": r"frames? (late|early)",
+    "length_unit": r"in another unit|unit of",
+    "baseline": r"another baseline",
+    "water_index": r"refractive index of",
 }
-"""Causes that a refusal names, by what it says of them."""
+"""Causes that a refusal names, by its words after "probably"."""
+AT_READING = {
+    "length_unit": r"did you mean|are in metres",
+    "resolution": r"puts the principal point outside",
+    "water_index": r"refractive_index",
+}
+"""Causes that the checks of a rig file name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,11 +145,16 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
 
 
 def causes_in(text: str) -> tuple[str, ...]:
-    """Codes of the causes that a sentence names, in the order of its words."""
+    """Codes of the causes that a refusal names, in the order of its words.
+
+    Hints at all that could be wrong name nothing: what is meant follows "probably".
+    """
+    _, probably, named = text.partition("probably ")
+    patterns = NAMED if probably else AT_READING
     places = {
         code: match.start()
-        for code, pattern in REFUSALS.items()
-        if (match := re.search(pattern, text))
+        for code, pattern in patterns.items()
+        if (match := re.search(pattern, named or text))
     }
     return tuple(sorted(places, key=lambda code: places[code]))
 
