@@ -3,8 +3,8 @@
     python pipelines/trust/against_colmap.py -o OUT --data DATA --cases CASES
         [--coral-full FOLDER] [--only TEXT]
 
-DATA holds ``uril_tank`` and ``coral_tg5``, CASES ``gopro_clip``; FOLDER some of the coral's
-photographs at their full size. What is not there is left out. Rendered sets are made in
+DATA holds ``uril_tank`` and ``coral_tg5``, CASES ``gopro_clip``; FOLDER some of the
+coral's photographs at their full size. What is not there is left out. Rendered sets are made in
 OUT. COLMAP runs with its defaults: features, exhaustive matching, incremental mapping,
 one OPENCV camera per folder; its largest model counts. A run that was stopped goes on.
 """

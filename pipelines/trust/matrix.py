@@ -175,9 +175,9 @@ def main() -> None:
     chosen = [m.name for m in MISTAKES if (options.only or "") in m.name]
     cases = [
         Case(mistake=name, dive=dive, trial=trial, images=options.images)
-        for name in chosen
-        for dive in DIVES
         for trial in range(options.trials)
+        for dive in DIVES
+        for name in chosen
         if (name, dive, trial) not in done
     ]
     with ProgressBars() as progress, stored.open("a", encoding="utf-8") as file:
