@@ -4,9 +4,10 @@
         [--coral-full FOLDER] [--only TEXT]
 
 DATA holds ``uril_tank`` and ``coral_tg5``, CASES ``gopro_clip``; FOLDER some of the
-coral's photographs at their full size. What is not there is left out. Rendered sets are made in
-OUT. COLMAP runs with its defaults: features, exhaustive matching, incremental mapping,
-one OPENCV camera per folder; its largest model counts. A run that was stopped goes on.
+coral's photographs at their full size. What is not there is left out. Rendered sets
+are made in OUT. COLMAP runs with its defaults: features, exhaustive matching,
+incremental mapping, one OPENCV camera per folder; its largest model counts. A run that
+was stopped goes on.
 """
 
 from __future__ import annotations

@@ -48,7 +48,9 @@ def correct_dive(seed: int) -> tuple[Dive, dict[str, Any]]:
     rig = _random_rig(rng, num_cameras, ports, altitude)
     poses = rich_motion(frames, altitude=altitude, extent=0.4 * altitude)
     if strip:
-        spacing = altitude * rng.uniform(0.15, 0.25)
+        lens = rig.cameras[0].camera  # neighbours overlap by 65 to 85 %
+        footprint = altitude * lens.height / (1.333 * lens.params[0])
+        spacing = footprint * rng.uniform(0.15, 0.35)
         poses = straight_strip(frames, spacing=spacing, altitude=altitude)
     relief = Relief(
         stddev=altitude * rng.uniform(0.03, 0.12),
