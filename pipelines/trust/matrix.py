@@ -130,10 +130,11 @@ def page(rows: list[dict[str, Any]], *, images: bool) -> str:
     caught = [r for r in rows if r["code"] and r["verdict"] != FITS and r["looked"]]
     good = sum(map(named, caught))
     misses = sum(map(wrong, rows))
+    share = f"{good} ({good / max(len(caught), 1):.1%})"
     summary = (
         f"\n**{misses} of {len(rows)}** runs are called fitting with something off by "
-        f"more than 3 of its ±. Of the {len(caught)} that were caught, have a "
-        f"single cause and were looked into, **{good} ({good / max(len(caught), 1):.1%})** name it.\n"
+        f"more than 3 of its ±. Of the {len(caught)} that were caught, have a single "
+        f"cause and were looked into, **{share}** name it.\n"
     )
     head = HEAD.format(
         option=" --images OUT/images" if images else "",
