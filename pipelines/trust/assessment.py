@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from uwsfm.calibration.error_budget import with_budget
 from uwsfm.pipeline import refined_verdict
 from uwsfm.rig import Rig
 from uwsfm.sfm.refine import Refined
@@ -20,6 +21,12 @@ class Assessment:
     """The reasons, and the causes in words."""
     causes: tuple[str, ...]
     """Codes, the likeliest first."""
+
+
+def with_deviations(refined: Refined) -> Refined:
+    """The result with its standard deviations in all."""
+    calibration, _ = with_budget(refined.calibration)
+    return replace(refined, calibration=calibration)
 
 
 def assessed(

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from assessment import assessed
+from assessment import assessed, with_deviations
 from dives import Dive
 from scipy.spatial.distance import pdist
 
@@ -81,9 +82,9 @@ class Outcome:
     causes: tuple[str, ...] = ()
     """Codes of the causes that are named, the likeliest first."""
     errors: dict[str, float] = field(default_factory=dict)
-    """Each error against the truth in its printed standard deviations."""
+    """Each error against the truth in its standard deviations "in all"."""
     z_scores: dict[str, float] = field(default_factory=dict)
-    """The signed ones, where the sign means something."""
+    """Signed errors in standard deviations from the images alone."""
     num_frames: int = 0
     num_observations: int = 0
     rms_px: float | None = None
@@ -119,6 +120,7 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
             start = start_from_matches(rig, frames, Steps(work), "", StartOptions())
             arrays = start.arrays()
             refined = refine_scene(start_scene(rig, start, arrays), rig)
+            refined = with_deviations(refined)
         except UwsfmError as error:
             text = str(error).replace(str(work), "OUT")
             return Outcome(
@@ -162,7 +164,8 @@ def causes_in(text: str) -> tuple[str, ...]:
 def errors_of(
     rig: Rig, refined: Refined, true_rig: Rig, true_points: Array
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Errors over printed standard deviations: sizes of all, and signed z-scores.
+    """Errors against the truth: sizes in deviations "in all", and signed z-scores in
+    those from the images.
 
     Args:
         rig: That was given.
@@ -174,50 +177,85 @@ def errors_of(
     errors: dict[str, float] = {}
     z_scores: dict[str, float] = {}
     entries = housing_summary(refined_rig(rig, scene), calibration)
-    stddev = scale_summary(calibration)["relative_stddev"]
+    summary = scale_summary(calibration)
+    metric = summary["relative_stddev"] is not None
     for entry, port, item in zip(entries, scene.ports, true_rig.cameras, strict=True):
-        scores, sizes = _port_scores(entry, port, item.port)
-        if stddev is None:  # lengths in an arbitrary unit cannot be wrong
-            scores = {k: v for k, v in scores.items() if "tilt" in k}
-        z_scores |= scores
-        errors |= sizes
-    if stddev is not None and calibration.covariance.determined:
+        for miss in _port_misses(entry, port, item.port):
+            if miss.is_length and not metric:  # a length in an arbitrary unit
+                continue
+            miss.enter(errors, z_scores)
+    if metric and calibration.covariance.determined:
         rows = well_seen(scene, true_points)
-        scale = relative_size(scene.points[rows], true_points[rows]) - 1.0
-        z_scores["scale"] = _over(scale, stddev)
+        Miss(
+            name="scale",
+            error=relative_size(scene.points[rows], true_points[rows]) - 1.0,
+            stddev=summary["relative_stddev"],
+            in_all=summary["relative_stddev_in_all"],
+        ).enter(errors, z_scores)
         errors["length"] = worst_length(calibration, true_points, rows)
-    errors |= {n: abs(z) for n, z in z_scores.items() if "tilt" not in n}
     return errors, z_scores
 
 
-def _port_scores(
-    entry: dict[str, Any], port: Port, true: Port
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Signed z-scores of what a port has, and sizes of what has no sign."""
+@dataclass(frozen=True, kw_only=True)
+class Miss:
+    """One estimate against the truth."""
+
+    name: str
+    error: float
+    stddev: float | None
+    """From the images."""
+    in_all: float | None
+    is_length: bool = False
+    signed: bool = True
+
+    def enter(self, errors: dict[str, float], z_scores: dict[str, float]) -> None:
+        if self.stddev is not None and self.signed:
+            z_scores[self.name] = _over(self.error, self.stddev)
+        if self.in_all is not None:
+            errors[self.name] = abs(_over(self.error, self.in_all))
+
+
+def _port_misses(entry: dict[str, Any], port: Port, true: Port) -> Iterator[Miss]:
     name = entry["name"]
     if type(port) is not type(true):
-        other = {} if isinstance(port, NoPort) else {f"{name} port": np.inf}
-        return {}, other
-    scores: dict[str, float] = {}
+        if not isinstance(port, NoPort):  # no number of it means anything
+            yield Miss(name=f"{name} port", error=1.0, stddev=0.0, in_all=0.0)
+        return
     if isinstance(port, FlatPort) and isinstance(true, FlatPort):
-        if entry["distance_stddev_m"] is not None:
-            miss = port.distance - true.distance
-            scores[f"{name} distance"] = _over(miss, entry["distance_stddev_m"])
-        stddev = entry["normal_stddev_deg"]
-        if stddev is None:
-            return scores, {}
-        for i, axis in enumerate("xy"):  # each has half of the mean square angle
-            miss = float(np.degrees(port.normal[i] - true.normal[i]))
-            scores[f"{name} tilt {axis}"] = _over(miss, stddev / np.sqrt(2.0))
-        angle = float(np.degrees(angle_between(port.normal, true.normal)))
-        return scores, {f"{name} tilt": _over(angle, stddev)}
+        yield Miss(
+            name=f"{name} distance",
+            error=port.distance - true.distance,
+            stddev=entry["distance_stddev_m"],
+            in_all=entry["distance_stddev_in_all_m"],
+            is_length=True,
+        )
+        stddev, in_all = (
+            entry[key] for key in ("normal_stddev_deg", "normal_stddev_in_all_deg")
+        )
+        yield Miss(
+            name=f"{name} tilt",
+            error=float(np.degrees(angle_between(port.normal, true.normal))),
+            stddev=stddev,
+            in_all=in_all,
+            signed=False,
+        )
+        if stddev is not None:
+            for i, axis in enumerate("xy"):  # each has half of the mean square angle
+                yield Miss(
+                    name=f"{name} tilt {axis}",
+                    error=float(np.degrees(port.normal[i] - true.normal[i])),
+                    stddev=stddev / np.sqrt(2.0),
+                    in_all=None,
+                )
     if isinstance(port, DomePort) and isinstance(true, DomePort):
         for i, axis in enumerate("xyz"):
-            stddev = entry["center_stddev_m"][i]
-            if stddev is not None:
-                miss = port.center[i] - true.center[i]
-                scores[f"{name} centre {axis}"] = _over(miss, stddev)
-    return scores, {}
+            yield Miss(
+                name=f"{name} centre {axis}",
+                error=port.center[i] - true.center[i],
+                stddev=entry["center_stddev_m"][i],
+                in_all=entry["center_stddev_in_all_m"][i],
+                is_length=True,
+            )
 
 
 def _over(miss: float, stddev: float) -> float:
@@ -272,9 +310,10 @@ def relative_size(points: Array, true_points: Array) -> float:
 def worst_length(
     calibration: CalibrationResult, true_points: Array, rows: IndexArray
 ) -> float:
-    """Greatest error of some long distances between points, in what is printed as ±.
+    """Greatest error of some long distances between points, in deviations "in all".
 
-    As ``uwsfm measure`` does, the larger of two deviations is taken.
+    Those are what ``uwsfm measure`` prints: the larger of two from the images, and the
+    errors of what was given.
     """
     points, propagation = calibration.scene.points, Propagation(calibration)
     rng = np.random.default_rng(0)
@@ -286,10 +325,12 @@ def worst_length(
         length = float(np.linalg.norm(step))
         places = propagation.of_points(np.array([a, b]))
         slopes = np.stack([step, -step])[None] / length
-        stddev = max(
-            float(np.sqrt(np.ravel(cov(places, slopes))[0]))
+        own = max(
+            float(cov(places, slopes)[0, 0])
             for cov in (propagation.covariance, propagation.clustered_covariance)
         )
+        given = float(propagation.given_covariance(places, slopes)[0, 0])
+        stddev = np.sqrt(own + max(given, 0.0))
         miss = length - float(np.linalg.norm(true_points[a] - true_points[b]))
         worst = max(worst, _over(abs(miss), stddev))
     return worst

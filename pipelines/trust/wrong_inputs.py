@@ -37,6 +37,9 @@ class Mistake:
     change: Change
     domes: bool = False
     """Made on a dive behind domes."""
+    hidden: bool = False
+    """No observation shows it, as with a baseline that is too short: all that can be
+    asked for is a scale whose ± is that of the baseline."""
     also: frozenset[str] = field(default=frozenset())
     """Causes that no observation can tell from the right one: naming one is right."""
 
@@ -568,11 +571,9 @@ def _one_of(*values: float) -> Callable[[np.random.Generator], float]:
 
 
 def _mistake(
-    code: str, name: str, change: Change, *also: str, domes: bool = False
+    code: str, name: str, change: Change, *also: str, **flags: bool
 ) -> Mistake:
-    return Mistake(
-        code=code, name=name, change=change, domes=domes, also=frozenset(also)
-    )
+    return Mistake(code=code, name=name, change=change, also=frozenset(also), **flags)
 
 
 _SINGLE_LENS = (
@@ -722,6 +723,7 @@ _PLACEMENT = (
         "baseline at a third to two thirds",
         _baseline(_uniform(0.33, 0.67)),
         "length_unit",
+        hidden=True,
     ),
 )
 
