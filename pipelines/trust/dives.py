@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort
 from uwsfm.rig import Rig
@@ -175,7 +176,8 @@ def read_dive(
                 if len(rows):
                     matches[a, b] = rows.astype(np.int64)
     return Dive(
-        rig=rig,
+        # Simulated rigs are exact; a person states no accuracy, so it is assumed.
+        rig=replace(rig, accuracy=RigAccuracy()),
         true_rig=true_rig,
         true_poses=np.asarray(rig_from_world, dtype=np.float64),
         names=frames.names,
