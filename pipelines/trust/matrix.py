@@ -129,11 +129,12 @@ def page(rows: list[dict[str, Any]], *, images: bool) -> str:
             lines.append(_line(mistake, mine))
     caught = [r for r in rows if r["code"] and r["verdict"] != FITS and r["looked"]]
     good = sum(map(named, caught))
-    misses = sum(map(wrong, rows))
+    shown = [row for row in rows if not by_name(row["mistake"]).hidden]
+    misses = sum(map(wrong, shown))
     share = f"{good} ({good / max(len(caught), 1):.1%})"
     summary = (
-        f"\n**{misses} of {len(rows)}** runs are called fitting with something off by "
-        f"more than 3 of its ±. Of the {len(caught)} that were caught, have a single "
+        f"\n**{misses} of {len(shown)}** runs are called fitting with something off by "
+        f"more than 3 of its ±, not counting what no observation shows (†). Of the {len(caught)} that were caught, have a single "
         f"cause and were looked into, **{share}** name it.\n"
     )
     head = HEAD.format(
@@ -153,7 +154,7 @@ def _line(mistake: Mistake, rows: list[dict[str, Any]]) -> str:
     fits = [Outcome(**_fields(row)) for row in rows if row["verdict"] == FITS]
     worst = max((outcome.worst for outcome in fits), default=None)
     cells = [
-        mistake.name,
+        mistake.name + (" †" if mistake.hidden else ""),
         f"`{mistake.code}`" if mistake.code else "-",
         *(str(count(verdict)) for verdict in (REFUSED, "does not fit", "doubtful")),
         str(sum(map(healed, rows))),
