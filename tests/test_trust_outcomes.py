@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from uwsfm.errors import InputError
+
 FOLDER = Path(__file__).parent.parent / "pipelines" / "trust"
 sys.path.insert(0, str(FOLDER))
 
@@ -74,7 +76,7 @@ def test_no_mistake_is_confidently_wrong(flat, mistake):
         dive = simulated_dive("small", num_frames=6, num_points=400, domes=True)
     try:
         wrong = mistake.applied(dive, 0)
-    except ValueError:  # the rig file cannot hold such numbers
+    except InputError:  # the rig file cannot hold such numbers
         return
     assert not outcome_of(wrong, diagnosed=False).confidently_wrong
 

@@ -134,8 +134,9 @@ def page(rows: list[dict[str, Any]], *, images: bool) -> str:
     share = f"{good} ({good / max(len(caught), 1):.1%})"
     summary = (
         f"\n**{misses} of {len(shown)}** runs are called fitting with something off by "
-        f"more than 3 of its ±, not counting what no observation shows (†). Of the {len(caught)} that were caught, have a single "
-        f"cause and were looked into, **{share}** name it.\n"
+        f"more than 3 of its ±, not counting what no observation shows (†). Of the "
+        f"{len(caught)} that were caught, have a single cause and were looked into, "
+        f"**{share}** name it.\n"
     )
     head = HEAD.format(
         option=" --images OUT/images" if images else "",
