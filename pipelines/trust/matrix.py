@@ -21,7 +21,7 @@ from wrong_inputs import MISTAKES, Mistake
 
 from uwsfm._files import replaced_file
 from uwsfm.console import ProgressBars
-from uwsfm.errors import UwsfmError
+from uwsfm.errors import InputError
 
 TRIALS = 3
 DIVES = ("sample", "six frames")
@@ -41,9 +41,10 @@ class Case:
     def run(self) -> dict[str, Any]:
         """Its outcome, as a row of the file of all runs."""
         mistake = by_name(self.mistake)
+        right = self.right(mistake)
         try:
-            wrong = mistake.applied(self.right(mistake), self.trial)
-        except UwsfmError as error:  # the rig file cannot hold such numbers
+            wrong = mistake.applied(right, self.trial)
+        except InputError as error:  # the rig file cannot hold such numbers
             text = str(error)
             outcome = Outcome(verdict=REFUSED, words=text, causes=causes_in(text))
         else:
