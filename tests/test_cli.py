@@ -164,11 +164,19 @@ def test_names_are_printed_as_they_are(capsys):
         "port": "flat",
         "normal": [0.0, 0.0, 1.0],
         "normal_stddev_deg": None,
+        "normal_stddev_in_all_deg": 2.0,
         "normal_verdict": "held",
         "distance_m": 0.02,
         "distance_stddev_m": None,
+        "distance_stddev_in_all_m": 0.004,
         "distance_verdict": "held",
     }
+    for angle in ("azimuth", "tilt"):
+        camera |= {
+            f"{angle}_deg": 0.0,
+            f"{angle}_stddev_deg": None,
+            f"{angle}_stddev_in_all_deg": 1.4,
+        }
     console.print(housing_table({"cameras": [camera], "scale": {"small_unit": "mm"}}))
     assert "[/x]" in capsys.readouterr().out
 

@@ -97,7 +97,7 @@ def test_scale_arbitrary_is_said_wherever_a_length_is(mono, tmp_path):
     found = run("refine", str(mono.model), str(mono.rig), "-o", str(out))
     assert found.returncode == 0, found.stderr
     text = " ".join(found.stdout.split())
-    assert "distance (1e-3, scale" in text
+    assert "distance (1e-3," in text and "scale │" in text
     assert "scale arbitrary: nothing determines it" in text
     assert " mm" not in text and "(mm)" not in text
     summary = json.loads((out / "summary.json").read_text())

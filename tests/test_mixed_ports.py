@@ -97,8 +97,8 @@ def test_what_is_said_of_a_dome(tmp_path):
     assert min(dome["center_stddev_m"]) > 0.0
     assert bare["port"] == "none" and "normal" not in bare
     rows = {row["if"]: row["cameras"] for row in budget_summary(error_budget(result))}
-    assert np.linalg.norm(rows["dome radius +1 mm"][1]["center_m"]) > 1e-4
-    assert rows["water index +0.01"][2]["center_m"] == [0.0, 0.0, 0.0]
+    assert np.linalg.norm(rows["dome radius of camera 1"][1]["center_m"]) > 1e-4
+    assert rows["water index"][2]["center_m"] == [0.0, 0.0, 0.0]
     assert verdicts(result, ["a", "b", "c"]) == ()
     (told,) = housing_warnings(rig, result)
     assert f"has no port of {rig.cameras[2].name}: lenses without one were" in told

@@ -18,7 +18,7 @@ from test_outside import (
 from uwsfm import Lengths, calibrate
 from uwsfm.calibration.places import misses, placed
 from uwsfm.calibration.propagation import FEATURE, Places, Propagation
-from uwsfm.calibration.uncertainty import clusters_of, scale_stddev
+from uwsfm.calibration.uncertainty import clusters_of, posterior_covariance
 from uwsfm.measuring.quantities import area, distance, height
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
@@ -114,7 +114,7 @@ def test_every_optimum_is_opened_where_it_was_left(name):
         gap = np.abs(sigma**2 * again - before)
         assert np.all(gap <= 1e-5 * spread[:, :, None] * spread[:, None])
     if stored.scale_stddev is not None:
-        again = scale_stddev(found.optimum)
+        again = posterior_covariance(found.optimum).covariance.scale_stddev
         assert again == pytest.approx(stored.scale_stddev, rel=1e-5)
 
 

@@ -179,7 +179,12 @@ def test_the_error_is_told_where_results_are(tmp_path):
     )
     ports = [camera.port for camera in rig.cameras]
     calibration = SimpleNamespace(
-        covariance=SimpleNamespace(cameras=[unknown] * 2),
+        covariance=SimpleNamespace(
+            cameras=[unknown] * 2,
+            judged_cameras=[unknown] * 2,
+            border_cols=np.full((2, 25), -1),
+            in_all=None,
+        ),
         scene=SimpleNamespace(cam_from_rig=rig.cam_from_rig, ports=ports),
         options=SimpleNamespace(refine_cam_from_rig=True),
     )

@@ -165,7 +165,7 @@ def test_digits_follow_the_standard_deviation():
 def test_stddevs_of_the_frames_are_those_of_their_centres(dive_result, rng):
     covariance = dive_result.result.calibration.covariance
     pose = dive_result.result.model.scene.rig_from_world[-1]
-    turns, places = frame_stddevs(covariance)
+    turns, places = frame_stddevs(covariance.frames)
     steps = rng.multivariate_normal(np.zeros(6), covariance.frames[-1], 20_000)
     moved = rigid3.perturb(pose, steps)
     centers = rigid3.inverse(moved)[:, 4:]

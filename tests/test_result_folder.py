@@ -93,7 +93,7 @@ def _without_model(out):
         (_without_calibration, "calibration.npz is missing: an earlier version"),
         (_cut_short, "calibration.npz is damaged, or of another version"),
         (_of_another_run, "is of another model than the one beside it"),
-        (_of_another_format, "has format 9, this version of uwsfm reads 1"),
+        (_of_another_format, "has format 9, this version of uwsfm reads 2"),
         (_of_another_size, "calibration.npz is damaged"),
         (_without_summary, "summary.json is missing: the run has not finished"),
         (_damaged_summary, "summary.json is damaged"),

@@ -15,7 +15,7 @@ from uwsfm.sfm.kernel_rows import near_rays, rays_in_rig, rig_rows
 from uwsfm.sfm.relative_pose import (
     RelativePoseOptions,
     estimate_relative_pose,
-    estimate_rig_relative_pose,
+    estimate_rig_relative_poses,
 )
 from uwsfm.solver.rig_pair import gap_with_jac, gaps
 
@@ -28,7 +28,7 @@ def pose_of(tangent) -> np.ndarray:
 
 
 def two_views(rig, motion, rng, num=200, depth=(2.0, 4.0), noise_px=0.0, wrong=0.0):
-    """(arguments of `estimate_rig_relative_pose`, pose, which matches are right)."""
+    """(arguments of `estimate_rig_relative_poses`, pose, which matches are right)."""
     cameras, cam_from_rig = rig
     pose = pose_of(motion)
     index_a, xy_a, index_b, xy_b = [], [], [], []
@@ -99,7 +99,7 @@ def test_rig_gives_the_length(rng):
     args, truth, right = two_views(
         four_cameras(), [0.02, 0.1, 0.05, -0.3, 0.1, 0.2], rng, noise_px=0.3, wrong=0.3
     )
-    found = estimate_rig_relative_pose(*args)
+    found, *_ = estimate_rig_relative_poses(*args)
     assert found.length_determined
     error = offset(found.b_from_a, truth)
     square = error @ np.linalg.solve(found.covariance, error)
@@ -219,7 +219,7 @@ def test_no_pose_where_there_is_none(rng):
     options = RelativePoseOptions(min_num_inliers=40, max_trials=500)
     assert estimate_relative_pose(*image_pair(args), options) is None
     few = (*args[:2], *(array[:7] for array in args[2:]))
-    assert estimate_rig_relative_pose(*few) is None
+    assert estimate_rig_relative_poses(*few) == []
 
 
 def test_input_is_checked(rng):
@@ -228,6 +228,6 @@ def test_input_is_checked(rng):
     with pytest.raises(InputError, match=r"\(19, 2\)"):
         estimate_relative_pose(lens, lens, args[3], args[5][:19])
     with pytest.raises(InputError, match="camera_idx"):
-        estimate_rig_relative_pose(*args[:2], args[2] + 1, *args[3:])
+        estimate_rig_relative_poses(*args[:2], args[2] + 1, *args[3:])
     with pytest.raises(InputError, match="length_m"):
         RelativePoseOptions(length_m=-1.0)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import uwsfm
+
 ROOT = Path(__file__).parent.parent
 DATA = Path(os.environ.get("UWSFM_DATA", ROOT.parent / "shared" / "data")) / "uril_tank"
 
@@ -75,3 +77,27 @@ def test_board_is_measured_well(study):
     assert checks.square_stddev < 0.15
     assert checks.planarity < 0.6
     assert checks.gap < 0.15
+
+
+def test_the_error_budget_holds_the_lens_and_the_held_rig(study):
+    """+0.01 of k1 moves both ports by 14 mm, +0.03 of k2 by 16: what a first budget
+    lacked, beside one camera alone and the angles of the rig."""
+    result, _, _ = study
+    calibration = result.calibration
+    rows = {row.name: row for row in uwsfm.error_budget(calibration)}
+    stddevs = calibration.options.given.stddevs[0]
+    for name, slot, amount, moved in (("k1", 17, 0.01, 14e-3), ("k2", 18, 0.03, 16e-3)):
+        row = rows[f"{name}, all cameras alike"]
+        for shift in row.shifts:
+            found = shift.distance_m * amount / stddevs[slot]
+            assert found == pytest.approx(moved, abs=2e-3)
+    for axis in "xyz":
+        assert f"cam_from_rig turned about {axis} of right" in rows
+    assert abs(rows["cx of left"].shifts[0].distance_m) > 2e-3
+    for own, total in zip(
+        calibration.covariance.cameras,
+        calibration.covariance.in_all.cameras,
+        strict=True,
+    ):
+        # A ruler says 12 to 25 mm: within two of the second, and none of the first.
+        assert total.distance_stddev_m > 4.0 * own.distance_stddev_m

@@ -12,7 +12,7 @@ from uwsfm._load_order import refuse_broken_zlib
 if TYPE_CHECKING:
     from uwsfm.batch import run_batch
     from uwsfm.calibration.bundle_adjustment import calibrate
-    from uwsfm.calibration.error_budget import error_budget
+    from uwsfm.calibration.error_budget import error_budget, with_budget
     from uwsfm.calibration.lengths import Distances, Lengths, Positions
     from uwsfm.calibration.observability import verdicts
     from uwsfm.calibration.perspective import perspective_adjustment
@@ -82,6 +82,7 @@ _HOMES = {
     "perspective_adjustment": "uwsfm.calibration.perspective",
     "predict_covariance": "uwsfm.calibration.uncertainty",
     "verdicts": "uwsfm.calibration.observability",
+    "with_budget": "uwsfm.calibration.error_budget",
     "dense_cloud": "uwsfm.dense.run",
     "export_colmap": "uwsfm.export.files",
     "export_housing": "uwsfm.export.housing",
@@ -153,6 +154,7 @@ __all__ = [
     "rig_of_refractive_colmap",
     "run_batch",
     "verdicts",
+    "with_budget",
     "write_cloud",
     "write_report",
 ]

@@ -21,6 +21,7 @@ from uwsfm.cli_options import (
     LeverArmOption,
     MapperOption,
     MatcherOption,
+    MaxFeaturesOption,
     PositionsOption,
     PriorOption,
     RefineOption,
@@ -131,6 +132,7 @@ def reconstruct(
     clahe: Annotated[
         bool, typer.Option(help="Raise the local contrast first: for turbid water.")
     ] = False,
+    max_features: MaxFeaturesOption = None,
     masks: Annotated[
         Path | None,
         typer.Option(help="Folder of masks, IMAGE.png beside each image path."),
@@ -178,6 +180,7 @@ def reconstruct(
             images,
             out,
             clahe=clahe,
+            max_features=max_features,
             masks=masks,
             matching=matching,
             matcher=matcher,
@@ -237,6 +240,7 @@ def calibrate(
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     matcher: MatcherOption = "colmap",
+    max_features: MaxFeaturesOption = None,
     scene_distance: SceneDistanceOption = None,
     seed: SeedOption = 0,
     threads: ThreadsOption = -1,
@@ -246,10 +250,13 @@ def calibrate(
 
     with ProgressBars() as progress:
         from uwsfm.housing_pipeline import calibrate_housing
-        from uwsfm.sfm.options import MatchOptions, StartOptions
+        from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
         front_end = StartOptions(
-            matching=MatchOptions(matcher=matcher), seed=seed, num_threads=threads
+            features=FeatureOptions(max_num_features=max_features),
+            matching=MatchOptions(matcher=matcher),
+            seed=seed,
+            num_threads=threads,
         )
         result = calibrate_housing(
             rig,
@@ -343,10 +350,19 @@ def demo(
 def _print_result(summary: dict) -> None:
     from rich.markup import escape
 
-    from uwsfm.console import console, housing_table, result_table, timings_table
+    from uwsfm.console import (
+        FEW_BUDGET_ROWS,
+        budget_table,
+        console,
+        housing_table,
+        result_table,
+        timings_table,
+    )
 
     console.print(result_table(summary))
     console.print(housing_table(summary))
+    if len(summary["error_budget"]) > 1:  # something was given that may be wrong
+        console.print(budget_table(summary, FEW_BUDGET_ROWS))
     for warning in summary["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
     earlier = summary.get("steps_of_earlier_runs", ())

@@ -43,6 +43,15 @@ MatcherOption = Annotated[
     Literal["colmap", "paper"],
     typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
 ]
+MaxFeaturesOption = Annotated[
+    int | None,
+    typer.Option(
+        min=100,
+        help="Features per image, about. Default: by the size of the images, 8192 up "
+        "to 2 megapixels, 12288 from 4.5. More features take more time.",
+        show_default=False,
+    ),
+]
 SeedOption = Annotated[
     int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
 ]

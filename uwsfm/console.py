@@ -91,28 +91,34 @@ _CENTER: tuple[tuple[str, slice], ...] = (("x, y", slice(0, 2)), ("z", slice(2, 
 
 def housing_table(summary: dict[str, Any]) -> Table:
     """The refined housings, each number with its standard deviation."""
-    table = Table(title="Housing: ± is one standard deviation", title_justify="left")
+    table = Table(
+        title="Housing: ± is one standard deviation, from the images and in all (with "
+        "the errors of what was given)",
+        title_justify="left",
+    )
     table.add_column("camera", no_wrap=True)
     table.add_column("port")
-    for column in ("estimate", "±", "by the images"):
+    for column in ("estimate", "± images", "± in all"):
         table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("verdict", justify="right")
     for camera in summary["cameras"]:
         for row in _port_rows(camera, summary["scale"]["small_unit"]):
             table.add_row(Text(camera["name"]), *row)
     return table
 
 
-def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, str, str, str]]:
-    """What, estimate, standard deviation and verdict of what a port has."""
+def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, ...]]:
+    """What, estimate, standard deviations and verdict of what a port has."""
     if camera["port"] == "none":
-        return [("none", "", "", "")]
+        return [("none", "", "", "", "")]
     if camera["port"] == "dome":
-        center, known = camera["center_m"], camera["center_stddev_m"]
+        center = camera["center_m"]
+        both = (camera["center_stddev_m"], camera["center_stddev_in_all_m"])
         return [
             (
                 f"dome centre {axes} ({unit})",
                 _millimetres(center[part]),
-                "-" if None in known else _millimetres(known[part]),
+                *("-" if None in own else _millimetres(own[part]) for own in both),
                 camera["center_verdict"],
             )
             for axes, part in _CENTER
@@ -122,14 +128,31 @@ def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, str, str, s
             "tilt x, y (deg)",
             _tilt(camera["normal"]),
             _number(camera["normal_stddev_deg"], "{:.3f}"),
+            _number(camera["normal_stddev_in_all_deg"], "{:.3f}"),
             camera["normal_verdict"],
         ),
+        *_paper_rows(camera),
         (
             f"distance ({unit})",
             f"{1e3 * camera['distance_m']:.2f}",
             _number(camera["distance_stddev_m"], "{:.2f}", 1e3),
+            _number(camera["distance_stddev_in_all_m"], "{:.2f}", 1e3),
             camera["distance_verdict"],
         ),
+    ]
+
+
+def _paper_rows(camera: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Azimuth phi and tilt theta of the normal, as Sedlazeck and Koch print them."""
+    return [
+        (
+            f"{key} (deg)",
+            f"{camera[f'{key}_deg']:.2f}",
+            _number(camera[f"{key}_stddev_deg"], "{:.2f}"),
+            _number(camera[f"{key}_stddev_in_all_deg"], "{:.2f}"),
+            "",
+        )
+        for key in ("azimuth", "tilt")
     ]
 
 
@@ -178,8 +201,11 @@ def calibration_table(summary: dict[str, Any]) -> Table:
 
 def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
     for entry in entries:
-        stddev = _number(entry["stddev"], "{:.5g}")
-        table.add_row(Text(entry["name"]), f"{entry['value']:.7g} ± {stddev}")
+        own, total = (
+            _number(entry[key], "{:.3g}") for key in ("stddev", "stddev_in_all")
+        )
+        text = f"{entry['value']:.7g} ± {own} from the images, ± {total} in all"
+        table.add_row(Text(entry["name"]), text)
 
 
 _SHIFTS: dict[str, tuple[str, ...]] = {
@@ -189,30 +215,48 @@ _SHIFTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def budget_table(summary: dict[str, Any]) -> Table:
-    """What errors of the given numbers would do to the housing."""
+BUDGET_ROWS = 12
+"""Effects that the console shows of a calibration; the files have all of them."""
+FEW_BUDGET_ROWS = 4
+"""The same, of a reconstruction."""
+
+
+def budget_table(summary: dict[str, Any], num_rows: int = BUDGET_ROWS) -> Table:
+    """What errors of the given numbers would do to the housing, the largest first."""
+    *rows, total = summary["error_budget"]
     table = Table(
-        title="If a given number is wrong by so much, in all cameras alike, then",
+        title="If a given number is wrong by one standard deviation, then",
         title_justify="left",
     )
-    table.add_column("given", no_wrap=True)
+    table.add_column("given")
+    table.add_column("by", justify="right")
     for camera in summary["cameras"]:
         name = camera["name"]
         for what in _SHIFTS[camera["port"]]:
             text = what.format(summary["scale"]["small_unit"])
             table.add_column(f"{name}\n{text}", justify="right")
-    for row in summary["error_budget"]:
-        cells = []
-        sign = "" if row is summary["error_budget"][-1] else "+"
-        number = "{:" + sign + ".2f}"
-        for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
-            if camera["port"] == "flat":
-                cells.append(_number(shift["tilt_deg"], "{:.3f}"))
-                cells.append(_number(shift["distance_m"], number, 1e3))
-            elif camera["port"] == "dome":
-                cells.append(_millimetres(shift["center_m"]))
-        table.add_row(row["if"], *cells)
+    table.add_column("lengths\n(%)", justify="right")
+    for row in rows[:num_rows]:
+        by = f"{row['amount']} ({row['deviation']})"
+        table.add_row(row["if"], by, *_budget_cells(summary, row, "+"))
+    if len(rows) > num_rows:
+        table.add_row(f"and {len(rows) - num_rows} smaller ones: see the file")
+    table.add_section()
+    table.add_row("all, correlated (±)", "", *_budget_cells(summary, total, ""))
     return table
+
+
+def _budget_cells(
+    summary: dict[str, Any], row: dict[str, Any], sign: str
+) -> Iterable[str]:
+    number = "{:" + sign + ".2f}"
+    for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
+        if camera["port"] == "flat":
+            yield _number(shift["tilt_deg"], "{:.3f}")
+            yield _number(shift["distance_m"], number, 1e3)
+        elif camera["port"] == "dome":
+            yield _millimetres(shift["center_m"])
+    yield _number(row["scale"], number, 1e2)
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -315,9 +359,14 @@ def timings_table(timings: dict[str, float], earlier: Collection[str] = ()) -> T
 
 
 def _scale(scale: dict[str, Any]) -> str:
-    """The verdict, and the standard deviation if there is one."""
-    stddev = scale["relative_stddev"]
-    return scale["verdict"] + ("" if stddev is None else f", ± {1e2 * stddev:.2g} %")
+    """The verdict, and the standard deviations if there are any."""
+    own, total = scale["relative_stddev"], scale["relative_stddev_in_all"]
+    if own is None or total is None:
+        return scale["verdict"]
+    return (
+        f"{scale['verdict']}, ± {1e2 * total:.2g} % of every length in all "
+        f"(± {1e2 * own:.2g} % from the images)"
+    )
 
 
 def _add_positions(table: Table, positions: dict[str, Any] | None) -> None:

@@ -26,7 +26,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from uwsfm.errors import InputError
-from uwsfm.rig_file import first_problem, read_yaml
+from uwsfm.rig_file import read_yaml
+from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -57,6 +58,7 @@ class OptionsEntry(Entry):
     """As of `uwsfm reconstruct`; None: its default."""
 
     clahe: bool | None = None
+    max_features: Annotated[int, Field(ge=100)] | None = None
     masks: str | None = None
     matching: Literal["auto", "exhaustive", "sequential"] | None = None
     matcher: Literal["colmap", "paper"] | None = None

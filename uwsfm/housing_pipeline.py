@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.error_budget import BudgetRow, error_budget
+from uwsfm.calibration.error_budget import BudgetRow, with_budget
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.errors import InputError
@@ -214,7 +214,7 @@ class _Job:
     ) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
         rig = refined_rig(self.rig, scene)
-        budget = error_budget(calibration)
+        calibration, budget = with_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,
@@ -225,7 +225,7 @@ class _Job:
             "warnings": [
                 *self._notes(),
                 *notes,
-                *housing_warnings(rig, calibration),
+                *housing_warnings(rig, calibration, budget),
             ],
             "error_budget": budget_summary(budget),
             "versions": versions(),

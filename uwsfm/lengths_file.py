@@ -32,7 +32,8 @@ from pydantic import Field, ValidationError
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig_file import first_problem, read_yaml
+from uwsfm.rig_file import read_yaml
+from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
 HEADER = ["frame", "x", "y", "z", "sx", "sy", "sz"]

@@ -1,7 +1,7 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
+from uwsfm.calibration.error_budget import BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
@@ -23,6 +24,7 @@ from uwsfm.export.files import (
 )
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
+    budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
@@ -77,6 +79,7 @@ def reconstruct(
     out: str | Path,
     *,
     clahe: bool = False,
+    max_features: int | None = None,
     masks: str | Path | None = None,
     matching: Matching = "auto",
     matcher: Matcher = "colmap",
@@ -106,6 +109,7 @@ def reconstruct(
             ``calibration.npz`` and ``summary.json``, each replaced as a whole;
             `uwsfm.open_result` reads it.
         clahe: Equalise contrast locally before the search for features.
+        max_features: Features per image, about; None: by the size of the images.
         masks: Folder of masks in COLMAP's naming.
         matching: "exhaustive", "sequential", or "auto" by the number of frames.
         matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
@@ -136,7 +140,9 @@ def reconstruct(
     out = output_folder(out, images)
     options = StartOptions(
         features=FeatureOptions(
-            clahe=clahe, mask_dir=None if masks is None else Path(masks)
+            clahe=clahe,
+            max_num_features=max_features,
+            mask_dir=None if masks is None else Path(masks),
         ),
         matching=MatchOptions(strategy=matching, matcher=matcher),
         mapping=MappingOptions(submap_frames=submap_frames),
@@ -191,6 +197,8 @@ class _Job:
         clock = time.perf_counter()
         arrays = start.arrays()
         refined = self._refined(start, arrays)
+        calibration, budget = with_budget(refined.calibration)
+        refined = replace(refined, calibration=calibration)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
         model = _model(self.rig, arrays, refined, out / WORK)
@@ -200,6 +208,8 @@ class _Job:
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
+        summary["warnings"] += housing_warnings(model.rig, calibration, budget)
+        summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
@@ -314,7 +324,6 @@ def _summary(
     cameras = housing_summary(model.rig, refined.calibration)
     warnings = mapped.pop("warnings")
     warnings += _images_without_points(model)
-    warnings += housing_warnings(model.rig, refined.calibration)
     del mapped["timings_s"]
     found = errors_summary(refined.calibration)
     after = found.pop("reprojection_rms_px")
@@ -352,9 +361,12 @@ def _images_without_points(model: Model) -> list[str]:
     ]
 
 
-def housing_warnings(rig: Rig, calibration: CalibrationResult) -> list[str]:
-    """What the images do not tell about the housings, one sentence each."""
-    warnings = list(verdicts(calibration, [camera.name for camera in rig.cameras]))
+def housing_warnings(
+    rig: Rig, calibration: CalibrationResult, budget: Sequence[BudgetRow] = ()
+) -> list[str]:
+    """What is not determined of the housings, one sentence each."""
+    names = [camera.name for camera in rig.cameras]
+    warnings = list(verdicts(calibration, names, budget))
     bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
     if bare:
         warnings.append(
@@ -397,3 +409,10 @@ def require_effect(options: CalibrateOptions) -> None:
     for name, (what, wanted) in refined.items():
         if getattr(options, name) is not None and not np.any(wanted):
             raise InputError(f"{name} has no effect: {what} is not refined")
+    lens = options.refine_focal, options.refine_principal_point
+    correlated = options.given is not None and options.given.correlated_prior
+    if correlated and not any((*lens, options.refine_distortion)):
+        raise InputError(
+            "accuracy.lens_prior: correlated has no effect: no lens parameter is "
+            "refined; add --refine focal, say, or leave this key out"
+        )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uwsfm._progress import Progress, silent
+from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError, UwsfmError
@@ -21,6 +22,7 @@ from uwsfm.export.files import (
 )
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
+    budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
@@ -237,14 +239,17 @@ class _Job:
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]
         model, refined = self._model(refined, tracks)
+        calibration, budget = with_budget(refined.calibration)
+        refined = replace(refined, calibration=calibration)
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, refined.calibration)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
+        summary["warnings"] += housing_warnings(model.rig, calibration, budget)
+        summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
-        calibration = refined.calibration
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report
         )
@@ -363,7 +368,7 @@ class _Job:
                 "mean_error_of_common_px": own,
                 "refractive_error_of_common_px": _mean(error),
             },
-            "warnings": notes + housing_warnings(model.rig, refined.calibration),
+            "warnings": notes,
             "images": recorded_images(self.images),
             "timings_s": self.timings,
             "versions": versions(),

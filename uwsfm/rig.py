@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY, Array
-from uwsfm.rig_values import UNIT_TOLERANCE
+from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, UNIT_TOLERANCE
 
 if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
     import pycolmap
 
+    from uwsfm.calibration.given_accuracy import GivenAccuracy
     from uwsfm.models.port import Port
     from uwsfm.models.radial_undistortion import LensConversion
     from uwsfm.models.refractive import RefractiveCamera
@@ -47,6 +49,8 @@ class RigCamera:
     """Greatest error of ``camera`` as a stand-in for a lens that COLMAP has no model
     of. None: nothing was converted."""
     conversion_rms_px: float | None = None
+    accuracy: CameraAccuracy = CameraAccuracy()
+    """How well the numbers above are known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,6 +73,8 @@ class Rig:
     refine_cam_from_rig: bool = True
     """Whether the images may turn the cameras against each other; False trusts the
     placement given, which must then be known."""
+    accuracy: RigAccuracy = field(default_factory=RigAccuracy)
+    """How well the shared numbers are known."""
 
     def __post_init__(self) -> None:
         self._check_cameras()
@@ -158,6 +164,29 @@ class Rig:
 
         return tuple(RefractiveCamera(c.camera, c.port) for c in self.cameras)
 
+    def given_accuracy(self) -> GivenAccuracy:
+        """The covariance of everything that this rig gives.
+
+        Raises:
+            InputError: an accuracy is of something that the rig does not have.
+        """
+        from uwsfm.calibration.given_accuracy import given_accuracy
+        from uwsfm.calibration.given_errors import camera_as_given
+
+        poses = self.cam_from_rig
+        cameras = [
+            camera_as_given(
+                item.name,
+                refractive,
+                np.zeros(3) if poses is None else poses[c, 4:],
+                item.accuracy,
+            )
+            for c, (item, refractive) in enumerate(
+                zip(self.cameras, self.refractive_cameras(), strict=True)
+            )
+        ]
+        return given_accuracy(cameras, self.accuracy, self.baseline_m)
+
     def with_geometry(self, cam_from_rig: ArrayLike, ports: Sequence[Port]) -> Rig:
         """This rig with new poses (C, 7) and ports (C); the baseline follows."""
         poses = np.asarray(cam_from_rig, dtype=np.float64)
@@ -206,13 +235,15 @@ def camera_from_colmap(
     for k in camera.focal_length_idxs():
         if params[k] <= 0:
             raise InputError(f"{names[k]} = {params[k]:g}; a focal length is positive")
+        if IMPLAUSIBLE_ALLOWED.get():
+            continue
         if params[k] < _MIN_FOCAL_PER_SIDE * max(width, height):
             raise InputError(
                 f"{names[k]} = {params[k]:g} is not the focal length in pixels of an "
                 f"image of {width} x {height}; is it in millimetres?"
             )
     for k, side in zip(camera.principal_point_idxs(), (width, height), strict=True):
-        if not 0 <= params[k] <= side:
+        if not 0 <= params[k] <= side and not IMPLAUSIBLE_ALLOWED.get():
             raise InputError(
                 f"{names[k]} = {params[k]:g} puts the principal point outside the "
                 f"image of {width} x {height}"

@@ -5,12 +5,12 @@ Whatever is wrong with a file ends in one sentence that names the file and the k
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import reprlib
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,18 +20,14 @@ import yaml
 from pydantic import ValidationError
 
 from uwsfm._files import replaced_file
+from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
 from uwsfm.models.port import DomePort, NoPort
 from uwsfm.rig import Rig, RigCamera
-from uwsfm.rig_schema import (
-    ENTRIES,
-    CameraEntry,
-    Entry,
-    RadialUndistortionLens,
-    RigFile,
-)
-from uwsfm.rig_values import ARBITRARY_SCALE, checked_baseline
+from uwsfm.rig_problems import first_problem
+from uwsfm.rig_schema import CameraEntry, RadialUndistortionLens, RigFile
+from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, checked_baseline
 
 FRESH_WATER = 1.333
 
@@ -68,15 +64,17 @@ def load_rig(path: str | Path) -> Rig:
     token = None
     try:
         data = read_yaml(Path(path))
-        token = ARBITRARY_SCALE.set(data.get("scale") == "arbitrary")
-        return _to_rig(RigFile.model_validate(data))
+        # What the images estimated stands, however far it is from any housing.
+        anything = data.get("scale") == "arbitrary" or data.get("estimated") is True
+        token = IMPLAUSIBLE_ALLOWED.set(anything)
+        return _to_rig(RigFile.model_validate(data), Path(path).parent)
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     finally:
         if token is not None:
-            ARBITRARY_SCALE.reset(token)
+            IMPLAUSIBLE_ALLOWED.reset(token)
 
 
 def read_yaml(path: Path) -> dict:
@@ -103,7 +101,7 @@ def read_yaml(path: Path) -> dict:
     return data
 
 
-def _to_rig(file: RigFile) -> Rig:
+def _to_rig(file: RigFile, folder: Path) -> Rig:
     poses: list[Any] = [IDENTITY]
     baseline = None
     for i, entry in enumerate(file.cameras):
@@ -115,13 +113,32 @@ def _to_rig(file: RigFile) -> Rig:
         if i == 1:
             baseline = entry.baseline_m or float(np.linalg.norm(poses[1][4:]))
     water = file.water.refractive_index
-    return Rig(
+    if isinstance(file.accuracy, str):
+        accuracy = RigAccuracy(exact=True)
+    else:
+        try:
+            accuracy = file.accuracy.to_accuracy(folder)
+        except InputError as error:
+            raise InputError(f"accuracy.covariance: {error}") from None
+    rig = Rig(
         cameras=tuple(_rig_camera(entry, water) for entry in file.cameras),
         cam_from_rig=np.array(poses) if len(poses) == len(file.cameras) else None,
         baseline_m=baseline,
         baseline_stddev_m=file.baseline_stddev_m,
         refine_cam_from_rig=file.refine_cam_from_rig,
+        accuracy=accuracy,
     )
+    _check_accuracy(rig)
+    return rig
+
+
+def _check_accuracy(rig: Rig) -> None:
+    """Refuse the accuracy of what this rig does not have."""
+    from uwsfm.models.lens import SUPPORTED_MODELS  # compiles kernels: not for init
+
+    models = {camera.camera.model_name for camera in rig.cameras}
+    if models <= set(SUPPORTED_MODELS):  # others are refused where they are used
+        rig.given_accuracy()
 
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
@@ -142,6 +159,7 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         valid_radius_px=lens.valid_radius_px,
         conversion_max_px=conversion.max_px if conversion else None,
         conversion_rms_px=conversion.rms_px if conversion else None,
+        accuracy=entry.accuracy.to_accuracy(),
     )
 
 
@@ -167,103 +185,6 @@ def _placement_problem(entry: CameraEntry, i: int, num_cameras: int) -> str:
     return ""
 
 
-def first_problem(
-    error: ValidationError, entries: Mapping[str, type[Entry]] = ENTRIES
-) -> str:
-    """The key path and sentence of the first problem, and how many others there are.
-
-    Args:
-        error: what pydantic found.
-        entries: the blocks of the file by the keys they are under, for what was meant.
-    """
-    problems = error.errors(include_url=False)
-    unknown = [p for p in problems if p["type"] in _UNKNOWN_KEY]
-    # A misspelt key is one mistake, not an unknown key and a missing one.
-    meant = {(*p["loc"][:-1], _meant_key(p["loc"], entries)) for p in unknown}
-    doubled = [p for p in problems if p["type"] == "missing" and p["loc"] in meant]
-    rest = [p for p in problems if not any(p is q for q in [*unknown, *doubled])]
-    first, *others = [*unknown, *rest]
-    key_path = ""
-    for part in first["loc"]:
-        if isinstance(part, int):
-            key_path += f"[{part}]"
-        elif not part.startswith("("):
-            key_path += f".{part}"
-    sentence = f"{key_path.lstrip('.')}: {_sentence(first, entries)}"
-    if others:
-        plural = "s" if len(others) > 1 else ""
-        sentence += f" (and {len(others)} more problem{plural} in this file)"
-    return sentence
-
-
-_UNKNOWN_KEY = ("extra_forbidden", "invalid_key")
-_WANTED = {
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "int_type": "a whole number",
-    "string_type": "text (between quotes if it looks like a number)",
-    "bool_type": "true or false",
-    "tuple_type": "a list",
-    "model_type": "a block of keys",
-    "literal_error": "{expected}",
-    "greater_than_equal": "at least {ge:g}",
-    "less_than_equal": "at most {le:g}",
-}
-
-
-def _sentence(problem: Any, entries: Mapping[str, type[Entry]]) -> str:
-    kind, value, context = problem["type"], problem["input"], problem.get("ctx", {})
-    if kind == "missing":
-        return "this key is missing"
-    if kind in _UNKNOWN_KEY:
-        return _unknown_key(problem["loc"], entries)
-    if kind == "value_error":
-        return str(context["error"])
-    if kind in ("too_short", "too_long"):
-        number = context.get("min_length", context.get("max_length"))
-        return f"needs {number} values, got {len(value)}"
-    if kind == "model_type" and value == "none":
-        return "write {type: none}"
-    if kind not in _WANTED:
-        return problem["msg"]
-    shown = "empty" if value is None else reprlib.repr(value)
-    if isinstance(value, bool):
-        shown = "yes (or true)" if value else "no (or false)"
-    return f"must be {_WANTED[kind].format(**context)}, not {shown}"
-
-
-_UNIT = re.compile(
-    r"_(m|[mcµu]m|met(er|re)s?|in(ch(es)?)?|ft|px|pixels?|deg|rad|xyzw)$"
-)
-
-
-def _meant_key(
-    loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]
-) -> str | None:
-    """The known key nearest to an unknown one: another unit, or a slip of the pen."""
-    known, key = _known_keys(loc, entries), str(loc[-1]).lower()
-    stem = _UNIT.sub("", key)
-    close = [k for k in known if _UNIT.sub("", k) == stem]
-    close += difflib.get_close_matches(key, known, n=1)
-    return close[0] if close else None
-
-
-def _known_keys(
-    loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]
-) -> list[str]:
-    parents = [part for part in loc[:-1] if isinstance(part, str)]
-    return list(entries[parents[-1] if parents else ""].model_fields)
-
-
-def _unknown_key(loc: tuple[int | str, ...], entries: Mapping[str, type[Entry]]) -> str:
-    meant = _meant_key(loc, entries)
-    if meant is None:
-        return f"unknown key; the keys here are {', '.join(_known_keys(loc, entries))}"
-    unit = {"_m": " (in metres)", "_px": " (in pixels)", "_xyzw": " (w last)"}
-    suffix = next((text for end, text in unit.items() if meant.endswith(end)), "")
-    return f"unknown key, did you mean {meant}{suffix}?"
-
-
 # ---- Writing ------------------------------------------------------------------------
 
 
@@ -274,6 +195,7 @@ def dump_rig(
     comments: Mapping[str, Sequence[str]] | None = None,
     *,
     arbitrary_scale: bool = False,
+    estimated: bool = False,
 ) -> None:
     """Write a rig.yaml that `load_rig` reads back to the same values.
 
@@ -283,6 +205,7 @@ def dump_rig(
         header_comment: Lines for the top of the file, without "#".
         comments: Lines above a camera, by its name; say, standard deviations.
         arbitrary_scale: Its lengths have no unit.
+        estimated: It is a result: a length that no housing has is read back as well.
     """
     comments = comments or {}
     unknown = set(comments) - {camera.name for camera in rig.cameras}
@@ -298,6 +221,9 @@ def dump_rig(
     if len(rig.cameras) > 1:
         top["baseline_stddev_m"] = float(rig.baseline_stddev_m)
         top["refine_cam_from_rig"] = rig.refine_cam_from_rig
+    if estimated:
+        top["estimated"] = True
+    top |= _shared_accuracy(rig.accuracy)
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):
         lines = [*comments.get(camera.name, ()), *_conversion_lines(camera)]
@@ -333,12 +259,37 @@ def _block(rig: Rig, i: int) -> dict[str, Any]:
     }
     if camera.valid_radius_px is not None:
         block["intrinsics"]["valid_radius_px"] = camera.valid_radius_px
+    own = {
+        key: list(value) if isinstance(value, tuple) else value
+        for key, value in asdict(camera.accuracy).items()
+        if value is not None
+    }
+    if own:
+        block["accuracy"] = own
     if i > 0 and rig.cam_from_rig is None:
         block["baseline_m"] = rig.baseline_m
     elif i > 0 and rig.cam_from_rig is not None:
         pose = rig.cam_from_rig[i].tolist()
         block["cam_from_rig"] = {"rotation_xyzw": pose[:4], "translation_m": pose[4:]}
     return block
+
+
+def _shared_accuracy(accuracy: RigAccuracy) -> dict[str, Any]:
+    """The key "accuracy" of the file; nothing if all of it is assumed."""
+    if accuracy.exact:
+        return {"accuracy": "exact"}
+    found: dict[str, Any] = {}
+    for key in ("baseline_m", "water_index"):
+        if getattr(accuracy, key) is not None:
+            found[key] = getattr(accuracy, key)
+    if accuracy.covariance is not None:
+        found["covariance"] = {
+            "names": list(accuracy.covariance.names),
+            "matrix": accuracy.covariance.matrix.tolist(),
+        }
+    if accuracy.lens_prior != "independent":
+        found["lens_prior"] = accuracy.lens_prior
+    return {"accuracy": found} if found else {}
 
 
 def _common_water(rig: Rig) -> float:

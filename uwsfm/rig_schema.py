@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -17,6 +18,12 @@ from pydantic import (
     model_validator,
 )
 
+from uwsfm.calibration.given_accuracy import (
+    CameraAccuracy,
+    NamedCovariance,
+    RigAccuracy,
+)
+from uwsfm.covariance_file import named_covariance, read_covariance
 from uwsfm.geometry.rigid3 import Array, from_rotmat
 from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.rig import (
@@ -239,6 +246,86 @@ _TaggedLens = Annotated[
 ]
 
 
+_Stddev = Annotated[_Number, Field(ge=0)]
+
+
+class CameraAccuracyEntry(Entry):
+    focal: _Stddev | None = None
+    principal_point_px: _Stddev | None = None
+    distortion: (
+        Annotated[tuple[_Stddev, ...], Field(strict=False, min_length=1)] | None
+    ) = None
+    thickness_m: _Stddev | None = None
+    glass_index: _Stddev | None = None
+    radius_m: _Stddev | None = None
+    normal_deg: _Stddev | None = None
+    distance_m: _Stddev | None = None
+    center_m: _Stddev | None = None
+    rotation_deg: _Stddev | None = None
+    direction_deg: _Stddev | None = None
+
+    def to_accuracy(self) -> CameraAccuracy:
+        return CameraAccuracy(**self.model_dump())
+
+
+class CovarianceBlock(Entry):
+    names: Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+    matrix: Annotated[tuple[_Numbers, ...], Field(strict=False)]
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> CovarianceBlock:
+        self.to_covariance()
+        return self
+
+    def to_covariance(self) -> NamedCovariance:
+        return named_covariance(self.model_dump())
+
+
+def _file_or_block(value: Any) -> str:
+    return "(file)" if isinstance(value, str) else "(covariance)"
+
+
+class RigAccuracyEntry(Entry):
+    baseline_m: _Stddev | None = None
+    water_index: _Stddev | None = None
+    covariance: (
+        Annotated[
+            Annotated[str, Tag("(file)")]
+            | Annotated[CovarianceBlock, Tag("(covariance)")],
+            Discriminator(_file_or_block),
+        ]
+        | None
+    ) = None
+    lens_prior: Literal["independent", "correlated"] = "independent"
+
+    def to_accuracy(self, folder: Path) -> RigAccuracy:
+        """Args:
+        folder: of the rig file, for the name of a file.
+        """
+        covariance = None
+        if isinstance(self.covariance, str):
+            covariance = read_covariance(folder / self.covariance)
+        elif self.covariance is not None:
+            covariance = self.covariance.to_covariance()
+        return RigAccuracy(
+            baseline_m=self.baseline_m,
+            water_index=self.water_index,
+            covariance=covariance,
+            lens_prior=self.lens_prior,
+        )
+
+
+def _rig_accuracy_tag(value: Any) -> str:
+    return "(exact)" if isinstance(value, str) else "(rig accuracy)"
+
+
+_RigAccuracy = Annotated[
+    Annotated[Literal["exact"], Tag("(exact)")]
+    | Annotated[RigAccuracyEntry, Tag("(rig accuracy)")],
+    Discriminator(_rig_accuracy_tag),
+]
+
+
 class CameraEntry(Entry):
     name: Annotated[str, AfterValidator(checked_text)]
     images: Annotated[str, AfterValidator(checked_folder)]
@@ -246,6 +333,7 @@ class CameraEntry(Entry):
     port: PortEntry
     cam_from_rig: CamFromRig | None = None
     baseline_m: Annotated[_Number, AfterValidator(checked_baseline)] | None = None
+    accuracy: CameraAccuracyEntry = CameraAccuracyEntry()
 
     @field_validator("intrinsics")
     @classmethod
@@ -260,6 +348,8 @@ class RigFile(Entry):
     water: WaterEntry
     baseline_stddev_m: Annotated[_Number, Field(ge=0)] = 0.0
     refine_cam_from_rig: bool = True
+    estimated: bool = False
+    accuracy: _RigAccuracy = RigAccuracyEntry()
     cameras: Annotated[tuple[CameraEntry, ...], Field(strict=False)]
 
 
@@ -276,4 +366,7 @@ ENTRIES: dict[str, type[Entry]] = {
     "(dome)": DomePortEntry,
     "(none)": NoPortEntry,
     "cam_from_rig": CamFromRig,
+    "accuracy": CameraAccuracyEntry,
+    "(rig accuracy)": RigAccuracyEntry,
+    "(covariance)": CovarianceBlock,
 }

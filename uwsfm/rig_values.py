@@ -19,15 +19,16 @@ UNIT_TOLERANCE = 1e-9
 _COPY_TOLERANCE = 1e-3
 
 
-ARBITRARY_SCALE: ContextVar[bool] = ContextVar("ARBITRARY_SCALE", default=False)
-"""Whether the lengths that are read have no unit: none of them is implausible then."""
+IMPLAUSIBLE_ALLOWED: ContextVar[bool] = ContextVar("IMPLAUSIBLE_ALLOWED", default=False)
+"""Whether numbers are read that no person would type: lengths without a unit, and
+estimates of an adjustment, which end wherever the images take them."""
 
 
 def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float:
     """Refuses negative lengths, and millimetres taken for metres."""
     if value < 0:
         raise InputError(f"{value:g} m is negative; a {noun} cannot be")
-    if value > limit and not ARBITRARY_SCALE.get():
+    if value > limit and not IMPLAUSIBLE_ALLOWED.get():
         guess = np.format_float_positional(float(f"{value / 1000:.6g}"), min_digits=3)
         raise InputError(
             f"{value:g} m is not a {noun}; {plural} are in metres, "
@@ -68,7 +69,7 @@ def checked_baseline(value: float) -> float:
 
 def checked_index(value: float) -> float:
     """A refractive index of water, glass or plastic."""
-    if not 1 <= value <= 2.5:
+    if not 1 <= value <= (4.0 if IMPLAUSIBLE_ALLOWED.get() else 2.5):
         raise InputError(
             f"{value:g} is not a refractive index; expected 1 to 2.5 "
             "(water about 1.33, acrylic 1.49, glass 1.46 to 1.52)"

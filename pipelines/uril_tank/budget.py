@@ -10,18 +10,19 @@ from uwsfm import CalibrationResult, error_budget
 
 
 def budget_table(calibration: CalibrationResult) -> str:
-    """Shifts of tilts and distances when a given number is wrong in both cameras."""
-    rows = error_budget(calibration)
+    """Shifts of tilts and distances when a given number is wrong by one deviation."""
+    *rows, total = error_budget(calibration)
     lines = [
-        "| if this were so | left: tilt deg | distance mm | right: tilt | distance |",
-        "|---|---|---|---|---|",
+        "| if this were wrong | by | left: tilt deg | distance mm | right: tilt "
+        "| distance |",
+        "|---|---|---|---|---|---|",
     ]
-    for row in rows:
+    for row in (*rows, total):
         cells = []
-        sign = "" if row is rows[-1] else "+"
+        sign = "" if row is total else "+"
         for shift in row.shifts:
             cells += [f"{shift.tilt_deg:.2f}", f"{1e3 * shift.distance_m:{sign}.1f}"]
-        lines.append(f"| {row.name} | {' | '.join(cells)} |")
+        lines.append(f"| {row.name} | {row.amount} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -1,190 +1,206 @@
-"""What errors of the given numbers would do to the estimates, without solving again.
+"""The error budget: what one standard deviation of each given number would do.
 
-The gradient g(x, p) vanishes at the optimum, so a given number p that is off by dp
-moves the estimate x by dx = -H_xx^-1 H_xp dp: one linearisation answers for all.
+By linear propagation, see `uwsfm.calibration.given_errors`. The last row is the exact
+propagation of their joint covariance, correlations included: no root sum of squares.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm._indices import distinct
-from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import Outside
-from uwsfm.calibration.priors import border_priors, with_terms
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
-from uwsfm.calibration.uncertainty import likelihood
+from uwsfm.calibration.given_errors import (
+    GivenReach,
+    given_reach,
+    with_given_errors,
+)
+from uwsfm.calibration.given_items import GivenItem, given_items
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, NoPort
+from uwsfm.models.lens import NUM_PARAMS
+from uwsfm.models.port import DomePort, FlatPort, Port
 from uwsfm.residuals import border
-from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver import schur
-from uwsfm.solver.layout import HELD, build_layout
-from uwsfm.solver.levenberg_marquardt import suitable_blas
-from uwsfm.solver.quasidefinite import symmetric
-from uwsfm.solver.reduced_factor import coupling_columns, inverse
-from uwsfm.solver.reduction import analyse
+from uwsfm.solver.layout import HELD
 
-FOCAL, CX, CY = border.FIRST_LENS, border.FIRST_LENS + 2, border.FIRST_LENS + 3
+TOGETHER = "all of these together"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shift:
-    """How the estimates of one camera would move."""
+    """How the estimates of one camera would move; standard deviations in the last row.
+    What is given and held does not count as moving."""
 
     distance_m: float
     normal: tuple[float, float, float]
     """Change of the port normal; its length is the angle in radians."""
     center_m: tuple[float, float, float]
     """Change of a dome's centre."""
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Turn of cam_from_rig about the axes of the camera, radians."""
+    lens: tuple[float, ...] = (0.0,) * NUM_PARAMS
+    """Change of refined lens parameters, in the order of `uwsfm.models.lens`."""
 
     @property
     def tilt_deg(self) -> float:
         return float(np.degrees(np.linalg.norm(self.normal)))
 
+    @property
+    def rotation_deg(self) -> float:
+        return float(np.degrees(np.linalg.norm(self.rotation)))
+
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetRow:
-    """One given number, wrong by so much in all cameras alike."""
+    """One given number, or one number of all cameras alike, wrong by one deviation."""
 
     name: str
+    amount: str
+    """Its standard deviation, with the unit; empty in the last row."""
+    assumed: bool
+    """The deviation is a default: nobody gave it."""
+    prior: bool
+    """The number is refined, and this is the deviation of its prior."""
     shifts: tuple[Shift, ...]
     """One per camera."""
+    scale: float
+    """Relative change of all lengths."""
+    share: float
+    """Largest shift, in standard deviations in all: what rows are sorted by."""
 
 
-def error_budget(result: CalibrationResult) -> tuple[BudgetRow, ...]:
-    """Shifts of all ports for a standard set of errors, by linear propagation.
+def error_budget(
+    calibration: CalibrationResult, reach: GivenReach | None = None
+) -> tuple[BudgetRow, ...]:
+    """What errors of everything that was given would do, the largest first.
 
-    A number that is refined without a prior shifts nothing; with one, its prior is what
-    is taken to be wrong. The last row is the root of the sum of squares of the others:
-    lengths of shifts, whose signs are lost.
+    A number that is refined without a prior shifts nothing and has no row.
 
     Args:
-        result: of a calibration; its options say what was held.
+        calibration: its options say what was held, and how well that is known.
+        reach: of the same, if there is one already.
 
     Returns:
-        One row per error; NaN if the observations do not determine the estimates.
+        One row per number, and one for all cameras alike; the last row is all of them
+        together, with their correlations. NaN if the observations do not determine the
+        estimates.
     """
-    scene, settings = result.scene.select(result.inliers)[0], result.options
-    changes = _standard_changes(scene)
-    at_zero = np.array(
-        [isinstance(port, FlatPort) and port.distance == 0.0 for port in scene.ports]
+    reach = given_reach(calibration) if reach is None else reach
+    sheet = _Sheet(calibration, reach)
+    rows = sorted(sheet.rows(), key=lambda row: -np.nan_to_num(row.share, nan=np.inf))
+    return (*rows, sheet.together())
+
+
+def with_budget(
+    calibration: CalibrationResult,
+) -> tuple[CalibrationResult, tuple[BudgetRow, ...]]:
+    """The calibration with its deviations "in all", and its error budget: what a
+    pipeline does once, at its end."""
+    reach = given_reach(calibration)
+    calibration = with_given_errors(calibration, reach)
+    return calibration, error_budget(calibration, reach)
+
+
+class _Sheet:
+    """Steps of the estimates, and what one standard deviation of each is in all."""
+
+    def __init__(self, calibration: CalibrationResult, reach: GivenReach) -> None:
+        self.ports = calibration.scene.ports
+        self.reach = reach
+        covariance = calibration.covariance
+        self.refined = covariance.border_cols != HELD
+        self.steps = np.where(self.refined[..., None], reach.border_steps, 0.0)
+        columns = covariance.border_cols
+        own = np.append(np.diag(covariance.border), 0.0)[columns]
+        flat = self.steps.reshape(columns.size, -1)
+        more = np.diag(reach.added(flat)).reshape(columns.shape)
+        self.stddevs = np.sqrt(np.maximum(own + more, 0.0))
+        scale = covariance.scale_stddev
+        self.has_scale = scale is not None
+        added = reach.added(reach.scale_step[None])[0, 0]
+        self.scale_stddev = np.sqrt((scale or 0.0) ** 2 + added)
+
+    def rows(self) -> Iterator[BudgetRow]:
+        items = list(given_items(self.reach, self.ports))
+        together: dict[str, list[GivenItem]] = {}
+        for item in items:
+            together.setdefault(item.what, []).append(item)
+        for what, members in together.items():
+            shared = len(members) > 1 and self._are_one(members)
+            if not shared:
+                yield from (self._row(f"{what} of {m.camera}", [m]) for m in members)
+            if len(members) > 1:
+                alike = what if shared else f"{what}, all cameras alike"
+                yield self._row(alike, members)
+
+    def _are_one(self, members: list[GivenItem]) -> bool:
+        """Whether cameras share a number, as the index of one water."""
+        changes = np.array([item.changes for item in members])
+        at = [int(np.argmax(np.abs(row))) for row in changes]
+        block = self.reach.covariance[np.ix_(at, at)]
+        spread = np.sqrt(np.diag(block))
+        return bool(np.all(block > 0.999 * np.outer(spread, spread)))
+
+    def _row(self, name: str, items: list[GivenItem]) -> BudgetRow:
+        changes = np.sum([item.changes for item in items], axis=0)
+        first = items[0]
+        step = self.steps @ changes
+        scale = float(self.reach.scale_step @ changes)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.abs(step)[self.refined] / self.stddevs[self.refined]
+        share = float(np.max(shares, initial=0.0))
+        if self.has_scale and self.scale_stddev > 0.0:
+            share = max(share, abs(scale) / float(self.scale_stddev))
+        pairs = zip(self.ports, step, strict=True)
+        return BudgetRow(
+            name=name,
+            amount=", ".join(dict.fromkeys(item.amount for item in items)),
+            assumed=first.assumed and not first.prior,
+            prior=first.prior,
+            shifts=tuple(_shift(port, row) for port, row in pairs),
+            scale=scale,
+            share=share,
+        )
+
+    def together(self) -> BudgetRow:
+        """Standard deviations by the joint covariance of everything that was given."""
+        shifts = []
+        for port, steps in zip(self.ports, self.steps, strict=True):
+            covariance = self.reach.added(steps, priors=True)
+            spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+            shift = _shift(port, spread)
+            if isinstance(port, FlatPort):
+                basis = unit_vector.tangent_basis(port.normal)
+                turn = covariance[border.NORMAL, border.NORMAL]
+                turned = np.sqrt(np.diag(basis @ turn @ basis.T))
+                shift = replace(shift, normal=_triple(turned))
+            shifts.append(shift)
+        variance = self.reach.added(self.reach.scale_step[None], priors=True)
+        return BudgetRow(
+            name=TOGETHER,
+            amount="",
+            assumed=False,
+            prior=False,
+            shifts=tuple(shifts),
+            scale=float(np.sqrt(max(variance[0, 0], 0.0))),
+            share=np.inf,
+        )
+
+
+def _shift(port: Port, row: Array) -> Shift:
+    normal, center, distance = np.zeros(3), np.zeros(3), 0.0
+    if isinstance(port, FlatPort):
+        normal = unit_vector.tangent_basis(port.normal) @ row[border.NORMAL]
+        distance = float(row[border.DISTANCE])
+    elif isinstance(port, DomePort):
+        center = row[border.CENTER]
+    return Shift(
+        distance_m=distance,
+        normal=_triple(normal),
+        center_m=_triple(center),
+        rotation=_triple(row[border.ROTATION]),
+        lens=tuple(row[border.LENS].tolist()),
     )
-    columns = settings.border_columns(scene.cameras, at_zero)
-    moved = _propagate(scene, settings, columns, np.stack(list(changes.values())))
-    rows = [
-        BudgetRow(name=name, shifts=_shifts(scene, step))
-        for name, step in zip(changes, moved, strict=True)
-    ]
-    total = tuple(
-        Shift(
-            distance_m=float(np.sqrt(sum(r.shifts[c].distance_m ** 2 for r in rows))),
-            normal=_root_sum([r.shifts[c].normal for r in rows]),
-            center_m=_root_sum([r.shifts[c].center_m for r in rows]),
-        )
-        for c in range(len(scene.cameras))
-    )
-    return (*rows, BudgetRow(name="all of these together", shifts=total))
-
-
-def _root_sum(vectors: list[tuple[float, float, float]]) -> tuple[float, float, float]:
-    return _triple(np.sqrt(np.sum(np.square(vectors), axis=0)))
-
-
-def _standard_changes(scene: Scene) -> dict[str, Array]:
-    """Errors worth knowing about, as steps of the border (C, BORDER_SIZE)."""
-    lenses = np.array([camera.lens for camera in scene.cameras])
-    nothing = np.zeros((len(scene.cameras), border.BORDER_SIZE))
-
-    def change(slots: Any, amount: Any) -> Array:
-        step = nothing.copy()
-        step[:, slots] = amount
-        return step
-
-    lengths = np.linalg.norm(scene.cam_from_rig[:, 4:], axis=1)
-    domes = [isinstance(port, DomePort) for port in scene.ports]
-    water = [not isinstance(port, NoPort) for port in scene.ports]
-    changes = {
-        "focal length +0.1 %": change([FOCAL, FOCAL + 1], 1e-3 * lenses[:, :2]),
-        "principal point +1 px in x": change(CX, 1.0),
-        "principal point +1 px in y": change(CY, 1.0),
-        "water index +0.01": change(border.WATER_INDEX, 0.01 * np.array(water)),
-        "glass index +0.01": change(border.GLASS_INDEX, 0.01 * np.array(water)),
-        "glass thickness +2 mm": change(border.THICKNESS, 2e-3 * np.array(water)),
-    }
-    if any(domes):
-        changes["dome radius +1 mm"] = change(border.RADIUS, 1e-3 * np.array(domes))
-    if np.any(lengths > 0.0):
-        changes["baseline +1 %"] = change(border.LENGTH, 0.01 * lengths)
-    return changes
-
-
-def _propagate(
-    scene: Scene, settings: CalibrateOptions, columns: IndexArray, changes: Array
-) -> Array:
-    """Steps (E, C, BORDER_SIZE) of the border for changes (E, C, BORDER_SIZE)."""
-    given = (columns == HELD) & np.any(changes != 0.0, axis=0)
-    num_free = int(columns.max(initial=-1)) + 1
-    extended = columns.copy()
-    extended[given] = num_free + np.arange(np.count_nonzero(given))
-    outside = Outside(scene, Lengths())  # of one camera, a length is taken for known
-    layout = build_layout(scene, extended, num_lengths=outside.num_lengths)
-    state = outside.placed(scene)
-    sigma = _sigma(scene, layout.num_frame_cols + num_free)
-    own = border_priors(scene, settings, columns, sigma)
-    used, frames = distinct(scene.point_idx), distinct(scene.frame_idx)
-    priors = with_terms(own, outside.terms(used, frames, sigma), state)
-    reduction, offset = analyse(layout), layout.num_frame_cols
-    with suitable_blas(reduction):
-        eqs = likelihood(layout, state, priors)
-        whole = schur.reduced_system(layout, reduction.graph, eqs, 0.0)
-        border = symmetric(whole.border)
-        # The order of the border is that of the columns: the given ones come last, but
-        # for the lengths.
-        kept = np.r_[:num_free, layout.num_camera_cols : layout.num_border_cols]
-        moved = np.arange(num_free, layout.num_camera_cols)
-        part = whole._replace(
-            coupling=np.ascontiguousarray(whole.coupling[:, kept]),
-            border=border[np.ix_(kept, kept)],
-            right_border=whole.right_border[kept],
-        )
-        found = inverse(reduction, part, layout.num_lengths)
-        if found is None:
-            return np.full(changes.shape, np.nan)
-        coupling = coupling_columns(whole)[:, moved]
-        right = -np.concatenate([coupling, border[np.ix_(kept, moved)]])
-        right = right @ changes[:, given].T  # (n, E)
-        if priors is not None:
-            known = (priors.weights > 0.0) & (columns != HELD)
-            pulled = changes[:, known] * priors.weights[known]
-            np.add.at(right, offset + columns[known], pulled.T)
-        border_steps = found.times(right)[offset : offset + num_free].T
-    padded = np.concatenate([border_steps, np.zeros((len(changes), 1))], axis=1)
-    return padded[:, columns]  # HELD = -1 reads the zeros at the end
-
-
-def _sigma(scene: Scene, num_unknowns: int) -> float:
-    """Noise of one coordinate at an optimum, px."""
-    squares = np.nansum(scene.residuals() ** 2)
-    count = 2 * scene.num_observations - num_unknowns - 3 * scene.num_points
-    return max(float(np.sqrt(squares / max(count, 1))), 1e-9)
-
-
-def _shifts(scene: Scene, step: Array) -> tuple[Shift, ...]:
-    shifts = []
-    for port, row in zip(scene.ports, step, strict=True):
-        turn, center, distance = np.zeros(3), np.zeros(3), 0.0
-        if isinstance(port, FlatPort):
-            turn = unit_vector.tangent_basis(port.normal) @ row[border.NORMAL]
-            distance = float(row[border.DISTANCE])
-        elif isinstance(port, DomePort):
-            center = row[border.CENTER]
-        shifts.append(
-            Shift(distance_m=distance, normal=_triple(turn), center_m=_triple(center))
-        )
-    return tuple(shifts)
 
 
 def _triple(vector: Array) -> tuple[float, float, float]:

@@ -40,7 +40,7 @@ def small_unit(scale_stddev: float | None) -> str:
 def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     """One sentence for everything that is doubtful about scale and place."""
     sentences = []
-    stddev = result.covariance.scale_stddev
+    stddev = result.covariance.judged_scale_stddev
     word = scale_verdict(stddev)
     if word == ARBITRARY:
         sentences.append(
@@ -56,11 +56,12 @@ def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     given = result.lengths is not None or result.positions is not None
     if stddev is not None and len(result.scene.cameras) == 1 and not given:
         sentences.append(
-            "the scale comes from refraction alone, with the port taken as given, and "
-            "errors of the port come on top of its standard deviation: if the port's "
-            "distance from the lens is 1 % wrong, all lengths are, about, and a tilt "
-            "of a degree or two that was not given can put them off by several "
-            "standard deviations, or make them twice as long"
+            "the scale comes from refraction alone, with the port taken as given: if "
+            "its distance from the lens is 1 % wrong, all lengths are, about, and a "
+            "tilt of a degree or two that was not given can make them several per "
+            "cent longer; the standard deviation in all holds what the rig file says "
+            f"of the port's accuracy, or what is assumed; {ASK_FOR_LENGTH} to do "
+            "without it"
         )
     if result.lengths is not None:
         sentences += _contradicted(result.lengths)

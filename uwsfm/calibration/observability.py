@@ -5,12 +5,13 @@ follows from the posterior covariance, and why from how the rig moved over what.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.length_verdicts import length_verdicts, small_unit
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
@@ -106,12 +107,16 @@ class Geometry:
         return "a flat sea floor at constant altitude", "fly at two altitudes"
 
 
-def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]:
-    """One sentence for everything refined that the images do not determine.
+def verdicts(
+    result: CalibrationResult, names: Sequence[str], budget: Sequence[BudgetRow] = ()
+) -> tuple[str, ...]:
+    """One sentence for everything refined that is not determined.
 
     Args:
-        result: of a calibration, with its covariance.
+        result: of a calibration, with its covariance; deviations "in all" count if
+            they are there.
         names: of its cameras.
+        budget: of the same, to name the given number that matters most.
 
     Returns:
         Nothing if all is determined.
@@ -126,6 +131,7 @@ def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]
         if camera.distance_at_zero
     )
     about_lengths = length_verdicts(result)
+    causes = _Causes(result, budget)
     if not covariance.determined:
         reason, advice = geometry.reason()
         return (
@@ -138,15 +144,44 @@ def verdicts(result: CalibrationResult, names: Sequence[str]) -> tuple[str, ...]
     return (
         *about_lengths,
         *at_zero,
-        *_distances(result, names, geometry),
-        *_tilts(result, names),
-        *_centers(result, names),
+        *_distances(result, names, geometry, causes),
+        *_tilts(result, names, causes),
+        *_centers(result, names, causes),
         *_inseparable(result, names),
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Causes:
+    """Whether the images or the given numbers leave an estimate open."""
+
+    result: CalibrationResult
+    budget: Sequence[BudgetRow]
+
+    def given(
+        self, image_word: str, size: Callable[[Shift], float], camera: int
+    ) -> str | None:
+        """The given number that matters most; None if it is the images that do not
+        determine the estimate."""
+        if image_word != "determined" or not self.budget:
+            return None
+        single = [row for row in self.budget[:-1] if "alike" not in row.name]
+        worst = max(single, key=lambda row: size(row.shifts[camera]), default=None)
+        if worst is None:
+            return None
+        word = "assumed" if worst.assumed else "given"
+        return (
+            f"errors of what was given leave it so, most of all {worst.name} "
+            f"({worst.amount.replace('+', '± ')}, {word}): give its accuracy in the "
+            "rig file if it is known better, or calibrate it again"
+        )
+
+
 def _distances(
-    result: CalibrationResult, names: Sequence[str], geometry: Geometry
+    result: CalibrationResult,
+    names: Sequence[str],
+    geometry: Geometry,
+    causes: _Causes,
 ) -> list[str]:
     """The weak directions of the port distances, weakest first."""
     covariance = result.covariance
@@ -155,9 +190,12 @@ def _distances(
     free = np.nonzero(cols != HELD)[0]
     if not len(free):
         return []
-    block = covariance.border[np.ix_(cols[free], cols[free])]
+    in_all = covariance.in_all
+    border_block = covariance.border if in_all is None else in_all.border
+    block = border_block[np.ix_(cols[free], cols[free])]
     # Neighbours' shared errors make the reported deviations larger than the block's.
-    reported = np.array([covariance.cameras[c].distance_stddev_m for c in free])
+    judged = covariance.judged_cameras
+    reported = np.array([judged[c].distance_stddev_m for c in free])
     grow = reported / np.sqrt(np.diag(block))
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
     ports = [result.scene.ports[c] for c in free]
@@ -171,11 +209,22 @@ def _distances(
         word = _verdict(stddev, WEAK_SHARE * typical, typical)
         if word == "determined":
             continue
-        reason, advice = geometry.reason()
         what = _direction(vector, [names[int(c)] for c in free])
+        verb = "are" if what.startswith("the distances") else "is"
+        camera = int(free[int(np.argmax(np.abs(vector)))])
+        own = _verdict(
+            covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * typical, typical
+        )
+        cause = causes.given(own, lambda shift: abs(shift.distance_m), camera)
+        known = f"{1e3 * stddev:.1f} {unit}"
+        if cause is not None:
+            sentences.append(
+                f"{what} {verb} {word}: standard deviation {known} in all; {cause}"
+            )
+            continue
+        reason, advice = geometry.reason()
         sentences.append(
-            f"{what} is {word} by {reason}: standard deviation {1e3 * stddev:.1f} "
-            f"{unit}; {advice}"
+            f"{what} {verb} {word} by {reason}: standard deviation {known}; {advice}"
         )
     return sentences
 
@@ -197,25 +246,33 @@ def _direction(vector: Array, names: list[str]) -> str:
     return f"the common distance of {which}" if same else f"the distances of {which}"
 
 
-def _tilts(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+def _tilts(
+    result: CalibrationResult, names: Sequence[str], causes: _Causes
+) -> list[str]:
     sentences = []
-    for c, camera in enumerate(result.covariance.cameras):
+    for c, camera in enumerate(result.covariance.judged_cameras):
         if not isinstance(result.scene.ports[c], FlatPort):
             continue
         refined = bool(result.covariance.border_cols[c, border.NORMAL][0] != HELD)
         word = normal_verdict(camera, refined)
         if word in ("weakly determined", "not determined"):
+            own = normal_verdict(result.covariance.cameras[c], refined)
+            cause = causes.given(own, lambda shift: shift.tilt_deg, c)
             sentences.append(
                 f"the tilt of the port of {names[c]} is {word}: standard deviation "
-                f"{camera.normal_stddev_deg:.2f} deg; more points or frames would help"
+                f"{camera.normal_stddev_deg:.2f} deg"
+                f"{'' if cause is None else ' in all'}; "
+                f"{cause or 'more points or frames would help'}"
             )
     return sentences
 
 
-def _centers(result: CalibrationResult, names: Sequence[str]) -> list[str]:
+def _centers(
+    result: CalibrationResult, names: Sequence[str], causes: _Causes
+) -> list[str]:
     unit = small_unit(result.covariance.scale_stddev)
     sentences = []
-    for c, camera in enumerate(result.covariance.cameras):
+    for c, camera in enumerate(result.covariance.judged_cameras):
         port = result.scene.ports[c]
         if not isinstance(port, DomePort):
             continue
@@ -223,10 +280,13 @@ def _centers(result: CalibrationResult, names: Sequence[str]) -> list[str]:
         word = center_verdict(port.radius, camera, refined)
         if word in ("weakly determined", "not determined"):
             x, y, z = (1e3 * value for value in camera.center_stddev_m)
+            own = center_verdict(port.radius, result.covariance.cameras[c], refined)
+            cause = causes.given(own, lambda s: math.hypot(*s.center_m), c)
+            advice = "hold it if it was measured better, or add nearer points and more"
             sentences.append(
                 f"the centre of the dome of {names[c]} is {word}: standard deviation "
-                f"{x:.1f}, {y:.1f}, {z:.1f} {unit}; hold it if it was measured better, "
-                "or add nearer points and more frames"
+                f"{x:.1f}, {y:.1f}, {z:.1f} {unit}"
+                f"{'' if cause is None else ' in all'}; {cause or advice + ' frames'}"
             )
     return sentences
 

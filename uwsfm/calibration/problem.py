@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.lengths import LengthFit, Lengths, PositionFit
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
@@ -35,6 +36,10 @@ PRIORS = (
 )
 
 
+LENS_PRIORS = PRIORS[4:]
+LENS_PARTS = ("focal", "principal_point", "distortion")
+
+
 @dataclass(frozen=True, kw_only=True)
 class CalibrateOptions:
     """Options of `uwsfm.calibrate`."""
@@ -44,8 +49,10 @@ class CalibrateOptions:
     "l2": least squares on everything, for data without outliers."""
     loss_scale_px: float = 3.0
     """Cauchy's c: keeps 15 % outliers at 1.1x the clean bound."""
-    prune_sigma: float = 3.5
-    """Observations beyond this many standard deviations are outliers."""
+    prune_sigma: float = 4.0
+    """Observations beyond this many standard deviations, of noise by the median, are
+    outliers: one in 3000 of normal errors. Those of real features have longer tails:
+    in frames of a compressed video 4 leaves out 6 % of what agrees within 4 px."""
     max_iterations: int = 50
     """Of each of the two solves; 5-8 are usual."""
     initial_damping: float = 1e-4
@@ -96,6 +103,9 @@ class CalibrateOptions:
     """Per coordinate."""
     distortion_stddev: float | None = None
     """Of each distortion parameter."""
+    given: GivenAccuracy | None = field(default=None, compare=False, repr=False)
+    """How well what is held is known, for `Covariance.in_all`, and the correlated prior
+    of lenses if it asks for one. None: the defaults, which are assumed."""
 
     def __post_init__(self) -> None:
         _one_of("loss", self.loss, LOSS_CODES)
@@ -131,6 +141,15 @@ class CalibrateOptions:
     def _check_error(self) -> None:
         """Refuse what another error than reprojection does not determine."""
         given = [name for name in PRIORS if getattr(self, name) is not None]
+        if self.given is not None and self.given.correlated_prior:
+            twice = [name for name in given if name in LENS_PRIORS]
+            if twice:
+                raise InputError(
+                    f"{twice[0]}: the rig file has lens_prior: correlated, which is a "
+                    "prior of the lenses already; leave one of the two out"
+                )
+            if any(getattr(self, f"refine_{name}") for name in LENS_PARTS):
+                given.append("lens_prior")
         pixels = self.strategy == "joint" and self.error_name == "reprojection"
         if given and not pixels:
             raise InputError(
@@ -262,6 +281,22 @@ class CameraCovariance:
     zero. They contradict the lens or the water index that was given."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InAll:
+    """What `Covariance` holds, from the images and from errors of what was given."""
+
+    cameras: tuple[CameraCovariance, ...]
+    """What was held has the standard deviation that it was given, or assumed, with."""
+    border: Array
+    """(B, B) of the refined parameters."""
+    given: Array
+    """(C BORDER_SIZE, C BORDER_SIZE) what errors of given numbers add, of all
+    parameters, the given ones included."""
+    frames: Array
+    """(F, 6, 6)"""
+    scale_stddev: float | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Covariance:
     """Posterior covariance at the optimum, scaled by the noise found in the data.
@@ -290,9 +325,26 @@ class Covariance:
     """False: the data leave some direction of the refined parameters free, and every
     standard deviation is NaN."""
     scale_stddev: float | None
-    """Relative standard deviation of the distance between two frames far apart. None:
-    nothing determines the scale, every length is in an arbitrary unit, and what is said
-    of lengths takes one distance between two frames for known."""
+    """Relative standard deviation of the factor that all distances of points share, see
+    `uwsfm.calibration.scale`. None: nothing determines the scale, every length is in an
+    arbitrary unit, and what is said of lengths takes one distance between two frames
+    for known."""
+    in_all: InAll | None = None
+    """With the errors of what was given, see `uwsfm.calibration.given_errors`; all of
+    the above is from the images and priors alone."""
+
+    @property
+    def judged_cameras(self) -> tuple[CameraCovariance, ...]:
+        """In all if that is known, else from the images: what verdicts go by."""
+        return self.cameras if self.in_all is None else self.in_all.cameras
+
+    @property
+    def judged_scale_stddev(self) -> float | None:
+        """The same, of the scale."""
+        own = self.scale_stddev
+        if own is None or not np.isfinite(own) or self.in_all is None:
+            return own
+        return self.in_all.scale_stddev
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,8 +20,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from uwsfm.calibration.clicks import pixels_by_point
+from uwsfm.calibration.given_errors import given_reach
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.calibration.reopened import reopened
 from uwsfm.calibration.uncertainty import (
     clusters_of,
     likelihood,
@@ -31,7 +31,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.clustered import cluster_scores
 from uwsfm.solver.covariance import reduced_covariance
-from uwsfm.solver.layout import HELD, Layout, build_layout
+from uwsfm.solver.layout import HELD, Layout, build_layout, with_columns
 from uwsfm.solver.levenberg_marquardt import suitable_blas
 from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.reduction import analyse
@@ -50,6 +50,8 @@ class Places:
     """(M, 3, 3) covariance of what is theirs alone; NaN if undetermined."""
     pull: sp.csr_array
     """(3 M, n) derivative by the unknowns of the reduced system."""
+    by_given: Array
+    """(3 M, G) derivative by the numbers that were given, see `GivenReach`."""
     in_model: IndexArray
     """(M,) index of a point of the model, `FEATURE` for what is none."""
 
@@ -63,6 +65,7 @@ class Places:
             points=self.points[rows],
             own=self.own[rows],
             pull=sp.csr_array(self.pull[blocks.ravel()]),
+            by_given=self.by_given[blocks.ravel()],
             in_model=self.in_model[rows],
         )
 
@@ -72,6 +75,7 @@ class Places:
             points=np.concatenate([part.points for part in parts]),
             own=np.concatenate([part.own for part in parts]),
             pull=sp.csr_array(sp.vstack([part.pull for part in parts], format="csr")),
+            by_given=np.concatenate([part.by_given for part in parts]),
             in_model=np.concatenate([part.in_model for part in parts]),
         )
 
@@ -86,7 +90,8 @@ class Propagation:
             calibration: of a scene, as `calibrate` or `open_result` give it.
         """
         self.scene = calibration.scene
-        self.optimum = reopened(calibration)
+        self._reach = given_reach(calibration)
+        self.optimum = self._reach.optimum
         layout = self.optimum.layout
         reduction = analyse(layout)
         with suitable_blas(reduction):
@@ -111,6 +116,7 @@ class Propagation:
             points=self.scene.points[point_idx],
             own=optimum.sigma_px**2 * _inverses(self._eqs.points[rows]),
             pull=_pull(optimum.layout, self._eqs, rows),
+            by_given=self._by_given(self._reach.layout, self._reach.eqs, rows),
             in_model=np.asarray(point_idx, dtype=np.int64),
         )
 
@@ -131,10 +137,14 @@ class Propagation:
         layout = layout._replace(frame_col=optimum.layout.frame_col)
         eqs = likelihood(layout, replace(optimum.state, points=seen.points), None)
         own = np.asarray(stddevs_px)[:, None, None] ** 2 * _inverses(eqs.points)
+        rows = np.arange(seen.num_points)
+        wider = with_columns(layout, self._reach.layout.border_col)
+        by_all = likelihood(wider, replace(optimum.state, points=seen.points), None)
         return Places(
             points=seen.points,
             own=own,
-            pull=_pull(layout, eqs, np.arange(seen.num_points)),
+            pull=_pull(layout, eqs, rows),
+            by_given=self._by_given(wider, by_all, rows),
             in_model=np.full(seen.num_points, FEATURE),
         )
 
@@ -177,6 +187,21 @@ class Propagation:
             )
             found += optimum.sigma_px**2 * prior
         return found + self._own(places, slopes, places.in_model == FEATURE)
+
+    def given_covariance(self, places: Places, slopes: Array) -> Array:
+        """What errors of the given numbers add to the covariance (K, K) of numbers.
+
+        Args:
+            places, slopes: as of `covariance`.
+        """
+        flat = slopes.reshape(len(slopes), -1)
+        return self._reach.added(flat @ places.by_given)
+
+    def _by_given(
+        self, layout: Layout, eqs: NormalEquations, rows: IndexArray
+    ) -> Array:
+        """(3 M, G) steps of points of a layout that has the given numbers' columns."""
+        return np.asarray(_pull(layout, eqs, rows) @ self._reach.unknowns)
 
     def _steps(self, places: Places, slopes: Array) -> tuple[Array, Array] | None:
         """s (n, K) and S^-1 s (n, K); None if S is singular."""

@@ -9,7 +9,7 @@ from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions, SolveHistory
 from uwsfm.calibration.strategies import STRATEGIES
-from uwsfm.calibration.uncertainty import Optimum, scale_stddev
+from uwsfm.calibration.uncertainty import Optimum, held_length_stddev
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DOME, FLAT, KIND
@@ -274,7 +274,7 @@ class Run:
         """Of the scale, relative, with nothing held; infinite if it is open."""
         free = replace(solved, layout=self._free(solved.layout))
         self.outside.hold_scale = False
-        stddev = scale_stddev(self.optimum(free, sigma_px))
+        stddev = held_length_stddev(self.optimum(free, sigma_px))
         self.outside.hold_scale = True
         return stddev
 

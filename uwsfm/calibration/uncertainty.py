@@ -11,13 +11,14 @@ from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
+from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DOME, KIND, DomePort
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver.clustered import clustered_covariance
+from uwsfm.solver.clustered import cluster_scores, clustered_covariance
 from uwsfm.solver.covariance import (
     ReducedCovariance,
     point_covariances,
@@ -81,21 +82,22 @@ def posterior_covariance(optimum: Optimum) -> Posterior:
         return _posterior_covariance(optimum, reduction)
 
 
-def scale_stddev(optimum: Optimum) -> float:
-    """Relative standard deviation of the scale; infinite if it is open."""
+def held_length_stddev(optimum: Optimum) -> float:
+    """Relative standard deviation of the distance between the two frames that holds an
+    open scale, if it were free; infinite if it is open."""
     reduction = analyse(optimum.layout)
     with suitable_blas(reduction):
         eqs = likelihood(optimum.layout, optimum.state, optimum.priors)
         reduced = reduced_covariance(optimum.layout, eqs, reduction)
         if not reduced.determined:
             return np.inf
-        stddev = _scale_stddev(
+        stddev = _frame_distance_stddev(
             optimum.layout, optimum.state, reduced, optimum.scale_ends
         )
     return optimum.sigma_px * stddev
 
 
-def _scale_stddev(
+def _frame_distance_stddev(
     layout: Layout, state: State, reduced: ReducedCovariance, ends: IndexArray
 ) -> float:
     """Relative standard deviation of the distance between two frames, unit noise."""
@@ -131,8 +133,10 @@ def _posterior_covariance(optimum: Optimum, reduction: Reduction) -> Posterior:
             camera_variances(b, cols, pose, dome) for b in (border, shared)
         )
         # Sampling noise can make the second one smaller: then the first is the truth.
-        cameras.append(_camera_covariance(np.maximum(alone, together), at_zero))
-    scale = _scale_stddev(layout, optimum.state, reduced, optimum.scale_ends)
+        cameras.append(camera_covariance(np.maximum(alone, together), at_zero))
+    scale = None
+    if not optimum.scale_held:
+        scale = _scale_stddev(optimum, eqs, reduced)
     covariance = Covariance(
         border=border,
         border_cols=optimum.columns,
@@ -140,7 +144,7 @@ def _posterior_covariance(optimum: Optimum, reduction: Reduction) -> Posterior:
         points=points,
         cameras=tuple(cameras),
         determined=reduced.determined,
-        scale_stddev=None if optimum.scale_held else optimum.sigma_px * scale,
+        scale_stddev=scale,
     )
     return Posterior(covariance, variance * reduced.navigation)
 
@@ -186,8 +190,11 @@ def predict_covariance(
     priors = with_terms(own, outside.terms(used, frames, noise_px), state)
     eqs = likelihood(layout, state, priors)
     reduced = reduced_covariance(layout, eqs)
-    scale = noise_px * _scale_stddev(layout, state, reduced, outside.ends)
     variance = noise_px**2
+    scale = None
+    if not outside.hold_scale:
+        unit_variance = _scale_variance(layout, state, eqs, reduced)[0]
+        scale = noise_px * float(np.sqrt(unit_variance))
     border = variance * reduced.border
     return Covariance(
         border=border,
@@ -195,7 +202,7 @@ def predict_covariance(
         frames=variance * reduced.frames,
         points=variance * point_covariances(layout, eqs, reduced),
         cameras=tuple(
-            _camera_covariance(
+            camera_covariance(
                 camera_variances(border, cols, pose, isinstance(port, DomePort)), False
             )
             for cols, pose, port in zip(
@@ -203,8 +210,50 @@ def predict_covariance(
             )
         ),
         determined=reduced.determined,
-        scale_stddev=None if outside.hold_scale else scale,
+        scale_stddev=scale,
     )
+
+
+def _scale_variance(
+    layout: Layout, state: State, eqs: NormalEquations, reduced: ReducedCovariance
+) -> tuple[float, float, Array]:
+    """Variance of the scale, unit noise, see `uwsfm.calibration.scale`; the part of the
+    points' own noise; and S^-1 times its derivative (n,)."""
+    if reduced.found is None:
+        return np.nan, np.nan, np.empty(0)
+    slope = scale_slope(state.points, reduced.points)
+    right = by_unknowns(layout, eqs, reduced.points, slope)
+    solved = reduced.found.times(right[:, None])[:, 0]
+    own = float(np.einsum("pi,pij,pj->", slope, reduced.points, slope))
+    return float(right @ solved) + own, own, solved
+
+
+def _scale_stddev(
+    optimum: Optimum, eqs: NormalEquations, reduced: ReducedCovariance
+) -> float:
+    """Of the scale, the larger of two as in `CameraCovariance`; NaN if it is open."""
+    layout, state = optimum.layout, optimum.state
+    alone, own, solved = _scale_variance(layout, state, eqs, reduced)
+    if not np.isfinite(alone):
+        return np.nan
+    scores = cluster_scores(
+        layout,
+        state.kernel_state(),
+        eqs,
+        reduced,
+        clusters_of(optimum),
+        solved[None],
+    )
+    share = 2 * len(layout.xy) / optimum.degrees_of_freedom
+    together = float(np.sum(scores**2)) * share + optimum.sigma_px**2 * own
+    if optimum.priors is not None:
+        split = layout.num_frame_cols
+        by_frame = solved[:split].reshape(-1, 6, 1)
+        prior = prior_covariance(
+            layout, state, optimum.priors, by_frame, solved[split:, None]
+        )
+        together += optimum.sigma_px**2 * float(prior[0, 0])
+    return float(np.sqrt(max(optimum.sigma_px**2 * alone, together)))
 
 
 def likelihood(layout: Layout, state: State, priors: Priors | None) -> NormalEquations:
@@ -301,7 +350,8 @@ def camera_variances(
     return np.array([normal, distance, rotation, *translation, *center])
 
 
-def _camera_covariance(variances: Array, at_zero: bool) -> CameraCovariance:
+def camera_covariance(variances: Array, at_zero: bool) -> CameraCovariance:
+    """Standard deviations of variances (9,) as of `camera_variances`."""
     normal, distance, rotation, x, y, z, *center = np.sqrt(variances).tolist()
     return CameraCovariance(
         normal_stddev_deg=float(np.degrees(normal)),

@@ -3,7 +3,8 @@
 What is in sparse/ and housing.yaml is not repeated: the file is read with the model,
 whose fingerprint it holds. Entries: ``about`` (JSON: format version, options, summary,
 fingerprint), the covariances (``border``, ``border_cols``, ``frames``, ``points``,
-``determined``, ``scale_stddev``), standard deviations of the cameras
+``determined``, ``scale_stddev``), how well the given numbers are known and what their
+errors add (``given.*``, ``in_all.*``), standard deviations of the cameras
 (``camera_stddevs``, ``distance_at_zero``), and, where they were given, what was known
 of lengths and positions (``entered.*``, ``bars.*``) and how it fits (``lengths.*``,
 ``positions.*``). ``frames`` is of left tangents [rotation, translation] of
@@ -21,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from uwsfm._files import replaced_file
+from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.lengths import (
     Distances,
     LengthFit,
@@ -34,6 +36,7 @@ from uwsfm.calibration.problem import (
     CalibrationResult,
     CameraCovariance,
     Covariance,
+    InAll,
     SolveHistory,
 )
 from uwsfm.errors import InputError
@@ -42,7 +45,7 @@ from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.scene import Scene
 
 CALIBRATION = "calibration.npz"
-VERSION = 1
+VERSION = 2
 RUN_AGAIN = "run the command that made it again"
 
 _BARS = ("points", "camera_idx", "frame_idx", "point_idx", "xy")
@@ -80,7 +83,7 @@ def write_calibration(calibration: CalibrationResult, path: Path, mark: str) -> 
     covariance = calibration.covariance
     about = {
         "version": VERSION,
-        "options": dataclasses.asdict(calibration.options),
+        "options": _options(calibration.options),
         "summary": dataclasses.asdict(calibration.summary),
         "fingerprint": mark,
     }
@@ -96,6 +99,7 @@ def write_calibration(calibration: CalibrationResult, path: Path, mark: str) -> 
     }
     if covariance.scale_stddev is not None:
         arrays["scale_stddev"] = covariance.scale_stddev
+    arrays |= _given(calibration)
     arrays |= _fields("lengths.", calibration.lengths)
     arrays |= _fields("positions.", calibration.positions)
     entered = calibration.entered
@@ -150,6 +154,58 @@ def read_calibration(path: Path, scene: Scene, mark: str) -> CalibrationResult:
     return calibration
 
 
+def _options(options: CalibrateOptions) -> dict[str, Any]:
+    """What JSON can hold; the accuracy of what was given is kept as arrays."""
+    return dataclasses.asdict(dataclasses.replace(options, given=None))
+
+
+def _given(calibration: CalibrationResult) -> dict[str, Any]:
+    """How well the given numbers are known, and deviations in all."""
+    arrays: dict[str, Any] = {}
+    given, in_all = calibration.options.given, calibration.covariance.in_all
+    if given is not None:
+        arrays["given.covariance"] = given.covariance
+        arrays["given.assumed"] = given.assumed
+        arrays["given.names"] = np.array(given.names)
+        arrays["given.correlated_prior"] = given.correlated_prior
+    if in_all is not None:
+        arrays["in_all.cameras"] = np.array([_camera_row(c) for c in in_all.cameras])
+        arrays["in_all.border"] = in_all.border
+        arrays["in_all.given"] = in_all.given
+        arrays["in_all.frames"] = in_all.frames
+        if in_all.scale_stddev is not None:
+            arrays["in_all.scale_stddev"] = in_all.scale_stddev
+    return arrays
+
+
+def _read_given(arrays: _Arrays, num_cameras: int) -> GivenAccuracy | None:
+    if "given.covariance" not in arrays:
+        return None
+    size = num_cameras * BORDER_SIZE
+    if arrays["given.covariance"].shape != (size, size):
+        raise ValueError("accuracy of another rig")
+    return GivenAccuracy(
+        covariance=arrays["given.covariance"],
+        assumed=arrays["given.assumed"],
+        names=tuple(arrays["given.names"].tolist()),
+        correlated_prior=bool(arrays["given.correlated_prior"]),
+    )
+
+
+def _in_all(arrays: _Arrays, at_zero: Array) -> InAll | None:
+    if "in_all.border" not in arrays:
+        return None
+    scale = arrays.get("in_all.scale_stddev")
+    rows = zip(arrays["in_all.cameras"], at_zero, strict=True)
+    return InAll(
+        cameras=tuple(_camera(row, bool(zero)) for row, zero in rows),
+        border=arrays["in_all.border"],
+        given=arrays["in_all.given"],
+        frames=arrays["in_all.frames"],
+        scale_stddev=None if scale is None else float(scale),
+    )
+
+
 _DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) + (
     zipfile.BadZipFile,
 )
@@ -181,11 +237,13 @@ def _calibration(
         cameras=tuple(_camera(row, bool(zero)) for row, zero in columns),
         determined=bool(arrays["determined"]),
         scale_stddev=None if scale is None else float(scale),
+        in_all=_in_all(arrays, arrays["distance_at_zero"]),
     )
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in about["options"].items()
     }
+    options["given"] = _read_given(arrays, num_cameras)
     return CalibrationResult(
         scene=scene,
         inliers=np.ones(scene.num_observations, dtype=bool),

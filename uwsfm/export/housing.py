@@ -1,6 +1,9 @@
 """housing.yaml: the refined rig, in the format of the rig file."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.observability import center_verdict, distance_verdict
@@ -10,7 +13,8 @@ from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
 
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
-Standard deviations are one sigma; normals are unit vectors from camera to water."""
+Standard deviations are one sigma; normals are unit vectors from camera to water.
+"estimated" lets it hold what no person would type; "accuracy" is in all."""
 ARBITRARY = """Scale arbitrary: nothing determined it. Every length below that was
 refined is in the arbitrary unit of the model, not in metres."""
 
@@ -28,42 +32,89 @@ def export_housing(
             camera.name: _comments(rig, calibration, index)
             for index, camera in enumerate(rig.cameras)
         }
-    dump_rig(rig, path, header, comments, arbitrary_scale=arbitrary)
+        rig = _with_accuracy(rig, calibration)
+    dump_rig(
+        rig,
+        path,
+        header,
+        comments,
+        arbitrary_scale=arbitrary,
+        estimated=calibration is not None,
+    )
+
+
+def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
+    """The rig with what is known of its estimates, for whoever holds them next."""
+    known = calibration.covariance.judged_cameras
+    turned = calibration.options.refine_cam_from_rig
+    cameras = []
+    for c, (camera, cov) in enumerate(zip(rig.cameras, known, strict=True)):
+        found: dict[str, Any] = {}
+        if camera.refine_normal:
+            found["normal_deg"] = cov.normal_stddev_deg
+        if camera.refine_distance and not cov.distance_at_zero:
+            found["distance_m"] = cov.distance_stddev_m
+        if camera.refine_center:
+            found["center_m"] = math.hypot(*cov.center_stddev_m) / math.sqrt(3.0)
+        if c > 0 and turned:
+            found["rotation_deg"] = cov.rotation_stddev_deg / math.sqrt(3.0)
+        digits: dict[str, Any] = {
+            key: float(f"{value:.4g}")
+            for key, value in found.items()
+            if math.isfinite(value)
+        }
+        cameras.append(replace(camera, accuracy=replace(camera.accuracy, **digits)))
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
     camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
+    in_all = calibration.covariance.judged_cameras[index]
     port = calibration.scene.ports[index]
     unit = small_unit(calibration.covariance.scale_stddev)
     lines = []
     if not calibration.covariance.determined:
         return ["the images do not determine this housing: no standard deviations"]
     if isinstance(port, DomePort) and camera.refine_center:
-        x, y, z = (f"{1e3 * value:.3f}" for value in cov.center_stddev_m)
-        verdict = center_verdict(port.radius, cov, True)
+        own, total = (
+            ", ".join(f"{1e3 * value:.3f}" for value in c.center_stddev_m)
+            for c in (cov, in_all)
+        )
+        verdict = center_verdict(port.radius, in_all, True)
         lines.append(
-            f"center: standard deviation {x}, {y}, {z} {unit}, {verdict} by the images"
+            f"center: standard deviation {own} {unit} from the images, {total} in all: "
+            f"{verdict}"
         )
     if isinstance(port, FlatPort):
-        lines += _flat_comments(camera, port, cov, unit)
+        lines += _flat_comments(camera, port, (cov, in_all), unit)
     if index > 0 and calibration.options.refine_cam_from_rig:
-        lines.append(f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg")
+        lines.append(
+            f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg from the "
+            f"images, {in_all.rotation_stddev_deg:.4f} in all"
+        )
     return lines
 
 
 def _flat_comments(
-    camera: RigCamera, port: FlatPort, cov: CameraCovariance, unit: str
+    camera: RigCamera,
+    port: FlatPort,
+    both: tuple[CameraCovariance, CameraCovariance],
+    unit: str,
 ) -> list[str]:
+    cov, in_all = both
     lines = []
     if camera.refine_normal:
-        lines.append(f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg")
-    verdict = distance_verdict(port.distance, cov, camera.refine_distance)
+        lines.append(
+            f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg from the "
+            f"images, {in_all.normal_stddev_deg:.4f} in all"
+        )
+    verdict = distance_verdict(port.distance, in_all, camera.refine_distance)
     if cov.distance_at_zero:
         lines.append(f"distance: {verdict}; the images contradict the lens in air")
     elif camera.refine_distance:
         lines.append(
-            f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit}, "
-            f"{verdict} by the images"
+            f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit} "
+            f"from the images, {1e3 * in_all.distance_stddev_m:.3f} in all: {verdict}"
         )
     return lines

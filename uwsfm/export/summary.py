@@ -21,8 +21,9 @@ from uwsfm.calibration.observability import (
     normal_verdict,
 )
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.calibration.tilt import paper_tilt
 from uwsfm.models.lens import param_slots
-from uwsfm.models.port import DomePort, NoPort, Port
+from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.residuals import border
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.solver.layout import HELD
@@ -41,25 +42,34 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
     """One entry per camera: the estimates, their standard deviations, the verdicts.
 
     A standard deviation is null where the value was held, or where the images do not
-    determine it; the verdict tells which.
+    determine it; the verdict shows which. Those "in all" add the errors of what was
+    given, and verdicts go by them; what was held has the one it was given with.
     """
     entries = []
+    covariance = calibration.covariance
     for index, camera in enumerate(rig.cameras):
-        cov = calibration.covariance.cameras[index]
+        cov, in_all = covariance.cameras[index], covariance.judged_cameras[index]
         pose = calibration.scene.cam_from_rig[index]
         turned = index > 0 and calibration.options.refine_cam_from_rig
+        placed = index > 0
         entries.append(
             {
                 "name": camera.name,
                 "lens_conversion_max_px": camera.conversion_max_px,
                 "lens_conversion_rms_px": camera.conversion_rms_px,
-                **_port_summary(camera, calibration.scene.ports[index], cov),
+                **_port_summary(camera, calibration, index),
                 "cam_from_rig": {
                     "rotation_xyzw": pose[:4].tolist(),
                     "translation_m": pose[4:].tolist(),
                     "rotation_stddev_deg": _stddev(cov.rotation_stddev_deg, turned),
                     "translation_stddev_m": [
                         _stddev(value, turned) for value in cov.translation_stddev_m
+                    ],
+                    "rotation_stddev_in_all_deg": _stddev(
+                        in_all.rotation_stddev_deg, placed
+                    ),
+                    "translation_stddev_in_all_m": [
+                        _stddev(value, placed) for value in in_all.translation_stddev_m
                     ],
                 },
             }
@@ -68,41 +78,61 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
 
 
 def _port_summary(
-    camera: RigCamera, port: Port, cov: CameraCovariance
+    camera: RigCamera, calibration: CalibrationResult, index: int
 ) -> dict[str, Any]:
     """What is known of a port; what is measured has the names of the rig file."""
+    port = calibration.scene.ports[index]
     if isinstance(port, NoPort):
         return {"port": "none"}
+    cov = calibration.covariance.cameras[index]
+    in_all = calibration.covariance.judged_cameras[index]
     if isinstance(port, DomePort):
-        place: dict[str, Any] = {
-            "port": "dome",
-            "center_m": list(port.center),
-            "center_stddev_m": [
-                _stddev(value, camera.refine_center) for value in cov.center_stddev_m
-            ],
-            "center_verdict": center_verdict(port.radius, cov, camera.refine_center),
-            "radius_m": port.radius,
-        }
+        place = _dome_summary(camera, port, cov, in_all)
     else:
-        at_zero = cov.distance_at_zero
         place = {
-            "port": "flat",
-            "normal": list(port.normal),
-            "normal_stddev_deg": _stddev(cov.normal_stddev_deg, camera.refine_normal),
-            "normal_verdict": normal_verdict(cov, camera.refine_normal),
-            "distance_m": port.distance,
-            "distance_stddev_m": _stddev(
-                cov.distance_stddev_m, camera.refine_distance and not at_zero
-            ),
-            "distance_verdict": distance_verdict(
-                port.distance, cov, camera.refine_distance
-            ),
+            **_flat_summary(camera, port, cov, in_all),
+            **asdict(paper_tilt(calibration, index)),
         }
     return {
         **place,
         "thickness_m": port.thickness,
         "glass_index": port.n_glass,
         "water_index": port.n_water,
+    }
+
+
+def _dome_summary(
+    camera: RigCamera, port: DomePort, cov: CameraCovariance, in_all: CameraCovariance
+) -> dict[str, Any]:
+    refined = camera.refine_center
+    return {
+        "port": "dome",
+        "center_m": list(port.center),
+        "center_stddev_m": [_stddev(v, refined) for v in cov.center_stddev_m],
+        "center_stddev_in_all_m": [_stddev(v, True) for v in in_all.center_stddev_m],
+        "center_verdict": center_verdict(port.radius, in_all, refined),
+        "radius_m": port.radius,
+    }
+
+
+def _flat_summary(
+    camera: RigCamera, port: FlatPort, cov: CameraCovariance, in_all: CameraCovariance
+) -> dict[str, Any]:
+    free = not cov.distance_at_zero
+    return {
+        "port": "flat",
+        "normal": list(port.normal),
+        "normal_stddev_deg": _stddev(cov.normal_stddev_deg, camera.refine_normal),
+        "normal_stddev_in_all_deg": _stddev(in_all.normal_stddev_deg, True),
+        "normal_verdict": normal_verdict(in_all, camera.refine_normal),
+        "distance_m": port.distance,
+        "distance_stddev_m": _stddev(
+            cov.distance_stddev_m, camera.refine_distance and free
+        ),
+        "distance_stddev_in_all_m": _stddev(in_all.distance_stddev_m, free),
+        "distance_verdict": distance_verdict(
+            port.distance, in_all, camera.refine_distance
+        ),
     }
 
 
@@ -132,11 +162,14 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
 
 
 def scale_summary(calibration: CalibrationResult) -> dict[str, Any]:
-    """Whether the lengths of a result are metres, and how well their scale is known."""
-    stddev = calibration.covariance.scale_stddev
+    """Whether the lengths of a result are metres, and how well the factor is known that
+    all point-to-point distances share, see `uwsfm.calibration.scale`."""
+    covariance = calibration.covariance
+    stddev, in_all = covariance.scale_stddev, covariance.judged_scale_stddev
     return {
-        "verdict": scale_verdict(stddev),
+        "verdict": scale_verdict(in_all),
         "relative_stddev": _stddev(math.nan if stddev is None else stddev, True),
+        "relative_stddev_in_all": _stddev(math.nan if in_all is None else in_all, True),
         "unit": "scale arbitrary" if stddev is None else "metre",
         "small_unit": small_unit(stddev),
     }
@@ -185,13 +218,23 @@ def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, 
     """Estimates beside ports and placement: water, baselines, lenses."""
     covariance, scene = calibration.covariance, calibration.scene
     stddevs = np.sqrt(np.append(np.diag(covariance.border), np.nan))
+    in_all = stddevs
+    if covariance.in_all is not None:
+        in_all = np.sqrt(np.append(np.diag(covariance.in_all.border), np.nan))
     entries = []
 
     def add(name: str, camera: int, slot: int, value: float) -> None:
         column = int(covariance.border_cols[camera, slot])
         if column != HELD:
             stddev = _stddev(float(stddevs[column]), True)
-            entries.append({"name": name, "value": value, "stddev": stddev})
+            entries.append(
+                {
+                    "name": name,
+                    "value": value,
+                    "stddev": stddev,
+                    "stddev_in_all": _stddev(float(in_all[column]), True),
+                }
+            )
 
     waters = calibration.covariance.border_cols[:, border.WATER_INDEX]
     for c in [c for c in range(len(waters)) if waters[c] not in waters[:c]]:
@@ -211,21 +254,34 @@ def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, 
 
 
 def budget_summary(rows: Sequence[BudgetRow]) -> list[dict[str, Any]]:
-    """What errors of the given numbers would do; null if that is not determined."""
+    """What one standard deviation of each given number would do, the largest first and
+    all together last; null if that is not determined."""
     return [
         {
             "if": row.name,
+            "amount": row.amount,
+            "deviation": _source(row),
+            "scale": _stddev(row.scale, True),
             "cameras": [
                 {
                     "tilt_deg": _stddev(shift.tilt_deg, True),
                     "distance_m": _stddev(shift.distance_m, True),
                     "center_m": [_stddev(value, True) for value in shift.center_m],
+                    "rotation_deg": _stddev(shift.rotation_deg, True),
+                    "lens": [_stddev(value, True) for value in shift.lens],
                 }
                 for shift in row.shifts
             ],
         }
         for row in rows
     ]
+
+
+def _source(row: BudgetRow) -> str | None:
+    """Where the standard deviation of a row comes from; null in the last."""
+    if not row.amount:
+        return None
+    return "prior" if row.prior else "assumed" if row.assumed else "given"
 
 
 def versions() -> dict[str, str]:

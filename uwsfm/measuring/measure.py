@@ -26,9 +26,10 @@ DOUBTFUL, CONTRADICTION = 2.0, 4.0
 """Standard deviations that a scale bar may be off by."""
 
 STDDEV = (
-    "one sigma, from the full covariance of rig, ports, poses and points: the larger "
-    "of two, every observation errs alone, or those of a quarter of an image together; "
-    "given the lens, the glass, the water and whatever else was held"
+    "one sigma, from the full covariance of rig, ports, poses and points; stddev is "
+    "from the images, the larger of two: every observation errs alone, or those of a "
+    "quarter of an image together; stddev_in_all adds the errors of what was given: "
+    "lens, glass, water, baseline and whatever else was held"
 )
 
 _COMPUTE = {
@@ -56,6 +57,8 @@ class Measurement:
     """The larger of the next two, or None."""
     stddev_alone: float | None
     stddev_clustered: float | None
+    stddev_in_all: float | None
+    """With the errors of what was given."""
     spots: tuple[Spot, ...]
     points: Array
     """(k, 3) places in the world."""
@@ -113,7 +116,8 @@ def measure(
         propagation.covariance(places, slopes),
         propagation.clustered_covariance(places, slopes),
     )
-    known = _Known(result, propagation, places, spotter.spots, both)
+    given = propagation.given_covariance(places, slopes)
+    known = _Known(result, propagation, places, spotter.spots, both, given)
     items = tuple(
         known.measurement(i, task, quantity, r, spotter.entered(task))
         for i, (task, quantity, r) in enumerate(zip(tasks, found, rows, strict=True))
@@ -148,10 +152,12 @@ class _Known:
     spots: Sequence[Spot]
     both: tuple[Array, Array]
     """(K, K) if every observation errs alone, and if neighbours err together."""
+    given: Array
+    """(K, K) from errors of what was given."""
 
     @property
     def scale_stddev(self) -> float | None:
-        return self.result.calibration.covariance.scale_stddev
+        return self.result.calibration.covariance.judged_scale_stddev
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -185,7 +191,8 @@ class _Known:
             and scale_verdict(self.scale_stddev) == "not determined"
         ):
             stddev = math.nan
-        known = math.isfinite(stddev)
+        in_all = math.hypot(stddev, unit * math.sqrt(max(self.given[i, i], 0.0)))
+        known = math.isfinite(in_all)
         spots = tuple(self.spots[row] for row in rows)
         notes = [spot.note for spot in spots if spot.note is not None]
         if not known:
@@ -193,13 +200,14 @@ class _Known:
         elif task.length_m is not None and entered:
             notes.append(_ENTERED)
         elif task.kind in ("distance", "polyline", "height", "area"):
-            notes += _of_its_size(quantity.value, stddev)
+            notes += _of_its_size(quantity.value, in_all)
         return Measurement(
             task=task,
             value=unit * quantity.value if known else None,
             stddev=stddev if known else None,
             stddev_alone=stddevs[0] if known else None,
             stddev_clustered=stddevs[1] if known else None,
+            stddev_in_all=in_all if known else None,
             spots=spots,
             points=self.places.points[list(rows)],
             places_stddev=self._stddevs_of_places(rows),
@@ -227,12 +235,14 @@ class _Known:
         value = np.array([items[i].value for i in rows], dtype=np.float64)
         known = np.array([items[i].task.length_m for i in rows], dtype=np.float64)
         own = np.array([items[i].task.stddev_m for i in rows]) ** 2
-        variance = np.array([items[i].stddev for i in rows], dtype=np.float64) ** 2
+        stddevs = [items[i].stddev_in_all for i in rows]
+        variance = np.array(stddevs, dtype=np.float64) ** 2
         weight = value / (variance + own)
         weight /= float(weight @ value)
         factor = float(weight @ known)
         block = np.ix_(rows, rows)
         shared = max(float(weight @ c[block] @ weight) for c in self.both)
+        shared += max(float(weight @ self.given[block] @ weight), 0.0)
         stddev = math.sqrt(shared + float(weight**2 @ own))
         ratio = (factor - 1.0) / stddev
         return {
@@ -314,6 +324,7 @@ def entry(item: Measurement, arbitrary: bool) -> dict[str, Any]:
         "stddev": item.stddev,
         "stddev_alone": item.stddev_alone,
         "stddev_clustered": item.stddev_clustered,
+        "stddev_in_all": item.stddev_in_all,
         "verdict": "not determined" if item.value is None else "determined",
     }
     if item.flatness is not None:
@@ -344,10 +355,10 @@ def bar_check(item: Measurement, arbitrary: bool) -> dict[str, Any]:
     task = item.task
     assert task.length_m is not None
     check: dict[str, Any] = {"known_m": task.length_m, "known_stddev_m": task.stddev_m}
-    if item.value is None or item.stddev is None or arbitrary:
+    if item.value is None or item.stddev_in_all is None or arbitrary:
         return {**check, "verdict": "no check: nothing determines the length"}
     deviation = item.value - task.length_m
-    stddev = math.hypot(item.stddev, task.stddev_m)
+    stddev = math.hypot(item.stddev_in_all, task.stddev_m)
     return {
         **check,
         "deviation_m": deviation,

@@ -29,7 +29,8 @@ from pydantic import Field, PlainValidator, ValidationError
 
 from uwsfm.errors import InputError
 from uwsfm.measuring.picks import Pick, parsed_pick
-from uwsfm.rig_file import first_problem, read_yaml
+from uwsfm.rig_file import read_yaml
+from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
 CLICK_STDDEV_PX = 1.0

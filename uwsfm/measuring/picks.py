@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from uwsfm.lengths_file import Click
-from uwsfm.rig_file import first_problem
+from uwsfm.rig_problems import first_problem
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _CLICK = re.compile(

@@ -17,31 +17,34 @@ def measurement_table(result: MeasureResult) -> Table:
     table = Table(title=title, title_justify="left")
     for column in ("", "kind"):
         table.add_column(column)
-    table.add_column("value ± std. dev.", justify="right")
+    table.add_column("value ± in all", justify="right")
+    table.add_column("± images", justify="right")
     table.add_column("")
     for item in result.measurements:
         table.add_row(
             escape(item.task.name),
             item.task.kind,
-            _number(item, arbitrary),
+            *_number(item, arbitrary),
             escape("; ".join(_remarks(item, arbitrary))),
         )
     bars = result.scale_bars
     if bars is not None and bars["num_bars"] > 1 or bars is not None and arbitrary:
         factor = f"{bars['known_over_measured']:.5f} ± {bars['stddev']:.5f}"
-        table.add_row("known / measured", "scale bars", factor, bars["verdict"])
+        table.add_row("known / measured", "scale bars", factor, "", bars["verdict"])
     return table
 
 
-def _number(item: Measurement, arbitrary: bool) -> str:
-    if item.value is None or item.stddev is None:
-        return "not determined"
+def _number(item: Measurement, arbitrary: bool) -> tuple[str, str]:
+    """The value with its deviation in all, and the deviation from the images."""
+    if item.value is None or item.stddev_in_all is None or item.stddev is None:
+        return "not determined", ""
     scale, unit = 1.0, ""
     if item.task.kind == "angle":
         unit = " deg"
     elif not arbitrary:
         scale, unit = _small(item.value, item.task.kind == "area")
-    return f"{rounded(scale * item.value, scale * item.stddev)}{unit}"
+    number = rounded(scale * item.value, scale * item.stddev_in_all)
+    return f"{number}{unit}", rounded(0.0, scale * item.stddev).split()[-1]
 
 
 def _small(value: float, is_area: bool) -> tuple[float, str]:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm.report.gather import Report, plain
 from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.report.tables import budget_columns, budget_lines
 from uwsfm.report.words import deviation, known_length_rows, position_words
 
 _BADGES = {
@@ -64,6 +65,8 @@ def page_of(report: Report) -> str:
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
         systematic=_systematic_words(report),
         known_lengths=known_length_rows(summary),
+        budget=budget_lines(summary),
+        budget_columns=budget_columns(summary),
         positions=position_words(summary),
         view_caption=_view_caption(report),
         residual_words=[_residual_words(camera) for camera in report.residuals],

@@ -30,6 +30,9 @@ class Estimate:
     name: str
     value: str
     stddev: str
+    """From the images."""
+    stddev_in_all: str
+    """With the errors of what was given."""
     unit: str
     word: str
     """Whether the images determine it; "given", "held"."""
@@ -47,7 +50,8 @@ class Frame:
     mean_error_px: float
     rms_error_px: float
     position_stddev_m: float
-    """Of the rig's centre relative to the first frame, root sum of three axes."""
+    """Of the rig's centre relative to the first frame, in all, root sum of three
+    axes."""
     rotation_stddev_deg: float
 
 
@@ -61,32 +65,45 @@ def estimates(summary: dict[str, Any]) -> tuple[Estimate, ...]:
     return (*rows, *_refined(summary))
 
 
+_Both = tuple[float | None, float | None]
+"""Standard deviations from the images and in all."""
+
+
 def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     (unit, scale), group = small_lengths(summary), camera["name"]
     if camera["port"] == "none":
-        return [_row(group, "port", "none", "", "", "given")]
+        return [_row(group, "port", "none", ("", ""), "", "given")]
     if camera["port"] == "dome":
+        both = zip(
+            camera["center_stddev_m"], camera["center_stddev_in_all_m"], strict=True
+        )
+        word = camera["center_verdict"]
         rows = [
-            _number(group, f"dome centre {axis}", value, stddev, unit, word, scale)
-            for axis, value, stddev, word in zip(
-                "xyz",
-                camera["center_m"],
-                camera["center_stddev_m"],
-                [camera["center_verdict"]] * 3,
-                strict=True,
+            _number(group, f"dome centre {axis}", value, stddevs, (unit, scale), word)
+            for axis, value, stddevs in zip(
+                "xyz", camera["center_m"], both, strict=True
             )
         ]
         rows.append(_given(group, "dome radius", 1e3 * camera["radius_m"], "mm"))
     else:
-        stddev, word = camera["normal_stddev_deg"], camera["normal_verdict"]
+        word = camera["normal_verdict"]
+        tilt = camera["normal_stddev_deg"], camera["normal_stddev_in_all_deg"]
         rows = [
-            _number(group, f"port tilt {axis}", value, stddev, "deg", word)
+            _number(group, f"port tilt {axis}", value, tilt, ("deg", 1.0), word)
             for axis, value in zip("xy", tilts_deg(camera["normal"]), strict=True)
         ]
-        distance, stddev = camera["distance_m"], camera["distance_stddev_m"]
+        for name, key in (("azimuth phi", "azimuth"), ("tilt theta", "tilt")):
+            known = camera[f"{key}_stddev_deg"], camera[f"{key}_stddev_in_all_deg"]
+            value = camera[f"{key}_deg"]
+            rows.append(
+                _number(group, f"port {name}", value, known, ("deg", 1.0), word)
+            )
+        known = camera["distance_stddev_m"], camera["distance_stddev_in_all_m"]
         word = camera["distance_verdict"]
         rows.append(
-            _number(group, "port distance", distance, stddev, unit, word, scale)
+            _number(
+                group, "port distance", camera["distance_m"], known, (unit, scale), word
+            )
         )
     rows.append(_given(group, "glass thickness", 1e3 * camera["thickness_m"], "mm"))
     rows.append(_given(group, "glass index", camera["glass_index"], ""))
@@ -97,16 +114,19 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
 
 def _placement(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     pose, group = camera["cam_from_rig"], camera["name"]
-    (unit, scale), turn_stddev = small_lengths(summary), pose["rotation_stddev_deg"]
+    both = pose["rotation_stddev_deg"], pose["rotation_stddev_in_all_deg"]
     turn = np.degrees(rigid3.rotvec_from_quat(pose["rotation_xyzw"])).tolist()
     rows = [
-        _number(group, f"cam_from_rig turn {axis}", value, turn_stddev, "deg")
+        _number(group, f"cam_from_rig turn {axis}", value, both, ("deg", 1.0))
         for axis, value in zip("xyz", turn, strict=True)
     ]
     place = pose["translation_m"], pose["translation_stddev_m"]
+    small = small_lengths(summary)
     rows += [
-        _number(group, f"cam_from_rig shift {axis}", value, stddev, unit, scale=scale)
-        for axis, value, stddev in zip("xyz", *place, strict=True)
+        _number(group, f"cam_from_rig shift {axis}", value, (stddev, total), small)
+        for axis, value, stddev, total in zip(
+            "xyz", *place, pose["translation_stddev_in_all_m"], strict=True
+        )
     ]
     return rows
 
@@ -126,10 +146,9 @@ def _refined(summary: dict[str, Any]) -> list[Estimate]:
                 group or "all",
                 name,
                 entry["value"],
-                entry["stddev"],
-                unit,
+                (entry["stddev"], entry["stddev_in_all"]),
+                (unit, scale),
                 "not determined" if entry["stddev"] is None else "refined",
-                scale,
             )
         )
     return rows
@@ -139,27 +158,89 @@ def _number(
     group: str,
     name: str,
     value: float,
-    stddev: float | None,
-    unit: str,
+    stddevs: _Both,
+    unit: tuple[str, float],
     word: str | None = None,
-    scale: float = 1.0,
 ) -> Estimate:
+    """Args:
+    unit: its name, and how many of it a unit of the summary is.
+    """
     if word is None:
-        word = "held" if stddev is None else "refined"
-    value_text, text = rounded(value, stddev, scale), deviation(stddev, scale)
-    return _row(group, name, value_text, text, unit, word)
+        word = "held" if stddevs[0] is None else "refined"
+    text, scale = unit
+    value_text = rounded(value, stddevs[0] or stddevs[1], scale)
+    own, total = (deviation(stddev, scale) for stddev in stddevs)
+    return _row(group, name, value_text, (own, total), text, word)
 
 
 def _given(group: str, name: str, value: float, unit: str) -> Estimate:
-    return _row(group, name, f"{value:.6g}", "-", unit, "given")
+    return _row(group, name, f"{value:.6g}", ("-", "-"), unit, "given")
 
 
 def _row(
-    group: str, name: str, value: str, stddev: str, unit: str, word: str
+    group: str, name: str, value: str, stddevs: tuple[str, str], unit: str, word: str
 ) -> Estimate:
     return Estimate(
-        group=group, name=name, value=value, stddev=stddev, unit=unit, word=word
+        group=group,
+        name=name,
+        value=value,
+        stddev=stddevs[0],
+        stddev_in_all=stddevs[1],
+        unit=unit,
+        word=word,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetLine:
+    """One given number, and what one standard deviation of it would do."""
+
+    name: str
+    amount: str
+    source: str
+    """"given", "assumed" or "prior"."""
+    effects: tuple[str, ...]
+    """In the columns of `budget_columns`."""
+
+
+def budget_columns(summary: dict[str, Any]) -> tuple[str, ...]:
+    """What the error budget has columns of."""
+    unit, columns = small_lengths(summary)[0], []
+    for camera in summary["cameras"]:
+        name = camera["name"]
+        if camera["port"] == "flat":
+            columns += [f"{name}: tilt (deg)", f"{name}: distance ({unit})"]
+        elif camera["port"] == "dome":
+            columns.append(f"{name}: centre ({unit})")
+    return (*columns, "lengths (%)")
+
+
+def budget_lines(summary: dict[str, Any]) -> tuple[BudgetLine, ...]:
+    """The error budget, the largest effect first and all together last."""
+    scale = small_lengths(summary)[1]
+    lines = []
+    for row in summary.get("error_budget", ()):
+        effects = []
+        for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
+            if camera["port"] == "flat":
+                effects.append(_effect(shift["tilt_deg"], 1.0))
+                effects.append(_effect(shift["distance_m"], scale))
+            elif camera["port"] == "dome":
+                effects.append(", ".join(_effect(v, scale) for v in shift["center_m"]))
+        effects.append(_effect(row["scale"], 1e2))
+        lines.append(
+            BudgetLine(
+                name=row["if"],
+                amount=row["amount"],
+                source=row["deviation"] or "",
+                effects=tuple(effects),
+            )
+        )
+    return tuple(lines)
+
+
+def _effect(value: float | None, scale: float) -> str:
+    return "-" if value is None else f"{scale * value:.3g}"
 
 
 def frames(model: Model, covariance: Covariance) -> tuple[Frame, ...]:
@@ -174,7 +255,8 @@ def frames(model: Model, covariance: Covariance) -> tuple[Frame, ...]:
     observations = np.bincount(scene.frame_idx, minlength=count)
     points = _distinct(scene.frame_idx, scene.point_idx, count)
     images = _distinct(scene.frame_idx, scene.camera_idx, count)
-    turn, place = frame_stddevs(covariance)
+    in_all = covariance.in_all
+    turn, place = frame_stddevs(covariance.frames if in_all is None else in_all.frames)
     return tuple(
         Frame(
             name=name,
@@ -190,13 +272,14 @@ def frames(model: Model, covariance: Covariance) -> tuple[Frame, ...]:
     )
 
 
-def frame_stddevs(covariance: Covariance) -> tuple[Array, Array]:
-    """Standard deviations (F,) of the frames' angles, degrees, and centres, metres.
+def frame_stddevs(frames: Array) -> tuple[Array, Array]:
+    """Standard deviations (F,) of the frames' angles, degrees, and centres, metres, by
+    the covariances (F, 6, 6) of their left tangents.
 
     The centre is -R^T t: a step v of the left tangent's translation moves it by -R^T v,
     which is as long, and one of its rotation not at all.
     """
-    variances = np.einsum("faa->fa", covariance.frames)
+    variances = np.einsum("faa->fa", frames)
     turn = np.degrees(np.sqrt(variances[:, :3].sum(axis=1)))
     return turn, np.sqrt(variances[:, 3:].sum(axis=1))
 

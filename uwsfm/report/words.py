@@ -79,10 +79,22 @@ def _decimals(stddev: float) -> int:
     return min(max(1 - math.floor(math.log10(stddev)), 0), 9)
 
 
-def with_deviation(value: float, stddev: float | None, unit: str, scale: float) -> str:
-    """An estimate in a sentence."""
-    known = "" if stddev is None else f" ± {deviation(stddev, scale)}"
-    return f"{rounded(value, stddev, scale)}{known} {unit}"
+def with_deviations(
+    value: float, own: float | None, total: float | None, unit: tuple[str, float]
+) -> str:
+    """An estimate in a sentence, with its deviation in all and that from the images.
+
+    Args:
+        value, own, total: in the unit of the summary.
+        unit: what is printed, and how many of it that unit is.
+    """
+    name, scale = unit
+    text = f"{rounded(value, own or total, scale)}"
+    if total is not None:
+        text += f" ± {deviation(total, scale)}"
+    if own is not None:
+        text += f" (± {deviation(own, scale)} from the images)"
+    return f"{text} {name}"
 
 
 def tilts_deg(normal: list[float]) -> tuple[float, float]:
@@ -131,6 +143,7 @@ def _sentence(text: str) -> str:
 def _metric(summary: dict[str, Any]) -> str:
     scale = summary["scale"]
     word, stddev = scale["verdict"], scale["relative_stddev"]
+    in_all = scale["relative_stddev_in_all"]
     if word == "arbitrary":
         return (
             "The model is not metric: nothing determines its scale, and every length "
@@ -138,7 +151,10 @@ def _metric(summary: dict[str, Any]) -> str:
         )
     if word == "not determined":
         return "The model is not metric: what was given does not determine its scale."
-    known = f"the distance between frames far apart is known to {1e2 * stddev:.2g} %"
+    known = (
+        f"every length shares an error of {1e2 * in_all:.2g} % in all, "
+        f"{1e2 * stddev:.2g} % from the images"
+    )
     kind = "metric" if word == "determined" else "metric, but weakly"
     return f"The model is {kind}: {known}. {_source(summary)}"
 
@@ -163,7 +179,8 @@ def _source(summary: dict[str, Any]) -> str:
         )
     text = f"Its scale comes from {', and from '.join(sources)}."
     if baseline is not None and stddev == 0.0 and len(sources) == 1:
-        text += " One per cent wrong there is one per cent wrong everywhere."
+        text += " One per cent wrong there is one per cent wrong everywhere; the error "
+        text += "budget shows how well it is known."
     return text
 
 
@@ -172,17 +189,29 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
     if camera["port"] == "none":
         return PortVerdict(camera=name, text="no port", words=())
     if camera["port"] == "dome":
-        parts = zip(camera["center_m"], camera["center_stddev_m"], strict=True)
-        center = ", ".join(with_deviation(v, s, *small) for v, s in parts)
+        parts = zip(
+            camera["center_m"],
+            camera["center_stddev_m"],
+            camera["center_stddev_in_all_m"],
+            strict=True,
+        )
+        center = ", ".join(with_deviations(v, s, t, small) for v, s, t in parts)
         return PortVerdict(
             camera=name,
             text=f"dome, its centre at {center} from the projection centre",
             words=(("centre", camera["center_verdict"]),),
         )
-    stddev = camera["normal_stddev_deg"]
+    stddev, total = camera["normal_stddev_deg"], camera["normal_stddev_in_all_deg"]
     tilt = ", ".join(rounded(value, stddev) for value in tilts_deg(camera["normal"]))
-    known = "" if stddev is None else f" ± {deviation(stddev)}"
-    distance = with_deviation(camera["distance_m"], camera["distance_stddev_m"], *small)
+    known = "" if total is None else f" ± {deviation(total)}"
+    if stddev is not None:
+        known += f" (± {deviation(stddev)} from the images)"
+    distance = with_deviations(
+        camera["distance_m"],
+        camera["distance_stddev_m"],
+        camera["distance_stddev_in_all_m"],
+        small,
+    )
     return PortVerdict(
         camera=name,
         text=f"flat port, its normal tilted by {tilt}{known} deg towards x and y, at "

@@ -130,7 +130,7 @@ def _extraction_options(
     small = size[0] * size[1] <= options.max_upsampled_px
     extraction.sift.first_octave = -1 if small else 0
     extraction.sift.peak_threshold = options.peak_threshold
-    extraction.sift.max_num_features = options.max_num_features
+    extraction.sift.max_num_features = options.num_features(*size)
     # A second orientation is the same position again: no second measurement.
     extraction.sift.max_num_orientations = 1
     return extraction

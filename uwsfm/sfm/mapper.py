@@ -22,6 +22,8 @@ MIN_INIT_ANGLE_FREE_DEG = 16.0
 """The same without a rig: at 4 degrees the mapper may begin with the two images of one
 frame, whose pose their short baseline leaves uncertain by degrees, and no rig holds it.
 Halved twice, it is still 4."""
+MIN_GIVEN_ANGLE_DEG = 1.0
+"""The same of a pair that was chosen for more than its angle."""
 MAX_EXTRA_PARAM = 1e3  # held parameters are not bogus, however large
 
 
@@ -31,6 +33,7 @@ def map_images(
     options: StartOptions,
     *,
     free: bool = False,
+    first_pair: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct from a mapping database; the models with most images come first.
@@ -40,12 +43,17 @@ def map_images(
         frames: The images.
         options: Those of the mapping are used, and the seed.
         free: The database has no rig, and the cameras' distortion is refined.
+        first_pair: Images (COLMAP's ids) to begin with; None: the mapper chooses.
         progress: Called with the step "mapping", in frames.
 
     Raises:
         UwsfmError: nothing could be reconstructed; says why, as far as it shows.
     """
     num_registered = 0
+    pipeline = _pipeline_options(options, frames, free)
+    if first_pair is not None:
+        pipeline.init_image_id1, pipeline.init_image_id2 = first_pair
+        pipeline.mapper.init_min_tri_angle = MIN_GIVEN_ANGLE_DEG
 
     def began() -> None:
         nonlocal num_registered
@@ -63,7 +71,7 @@ def map_images(
                 mapping_path,
                 frames.image_dir,
                 scratch,
-                options=_pipeline_options(options, frames, free),
+                options=pipeline,
                 initial_image_pair_callback=began,
                 next_image_callback=went_on,
                 cancellation_token=token,

@@ -17,6 +17,10 @@ Mapper = Literal["pinhole", "refractive"]
 
 MIN_SUBMAP = 10
 """Frames: of fewer no housing can be told."""
+BASE_FEATURES, BASE_PIXELS, MAX_GROWTH = 8192, 2_000_000, 1.5
+"""Features of an image of so many pixels, and how many times more a larger one has:
+matching takes the square of it."""
+MIN_FEATURES = 100
 MAX_SEED = 2**31 - 1  # COLMAP takes 32 bits
 
 
@@ -37,16 +41,29 @@ class FeatureOptions:
     peak_threshold: float = 0.005
     """Least contrast. COLMAP's 0.0067 finds less than half as many features in water;
     0.003 finds three times more, but noisier ones at three times the cost."""
-    max_num_features: int = 4096
+    max_num_features: int | None = None
     """Per image, about; the largest are kept. Twice as many cost twice the time, and
-    make the errors of a housing a third smaller."""
+    make the errors of a housing a third smaller. None: 8192 up to 2 megapixels, as
+    COLMAP, and up to 12288 for larger images, with the square root of their size."""
     max_upsampled_px: int = 2_000_000
     """Images of at most so many pixels are searched at twice their size: that finds
     more features, and places them better; larger images have enough without."""
     max_image_size: int = 3200
     """Longer images are reduced for the search; pixels refer to the full image."""
 
+    def num_features(self, width: int, height: int) -> int:
+        """How many features an image of so many pixels may have."""
+        if self.max_num_features is not None:
+            return self.max_num_features
+        growth = math.sqrt(width * height / BASE_PIXELS)
+        return round(BASE_FEATURES * min(max(growth, 1.0), MAX_GROWTH))
+
     def __post_init__(self) -> None:
+        if self.max_num_features is not None and self.max_num_features < MIN_FEATURES:
+            raise InputError(
+                f"max_features must be at least {MIN_FEATURES}, got "
+                f"{self.max_num_features}: fewer features join no images"
+            )
         if self.mask_dir is not None and not Path(self.mask_dir).is_dir():
             raise InputError(f"mask directory {self.mask_dir} does not exist")
 

@@ -48,6 +48,7 @@ def rig_options(rig: Rig) -> dict[str, Any]:
         "refine_centers": tuple(camera.refine_center for camera in rig.cameras),
         "refine_cam_from_rig": rig.refine_cam_from_rig,
         "baseline_stddev_m": rig.baseline_stddev_m,
+        "given": rig.given_accuracy(),
     }
 
 

@@ -31,7 +31,12 @@ from uwsfm.sfm.kernel_rows import (
     rig_rows,
 )
 from uwsfm.sfm.relative_pose_options import RelativePoseOptions
-from uwsfm.sfm.relative_pose_start import MotionLine, central_pose, image_pairs
+from uwsfm.sfm.relative_pose_start import (
+    MotionLine,
+    central_poses,
+    distinct_ends,
+    image_pairs,
+)
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.rig_pair import (
     gaps,
@@ -116,12 +121,13 @@ def estimate_relative_pose(
     num = len(np.asarray(xy_a))
     index = np.zeros(num, dtype=np.int64)
     poses = np.stack([rigid3.IDENTITY, rigid3.IDENTITY])
-    return estimate_rig_relative_pose(
+    motions = estimate_rig_relative_poses(
         (camera_a, camera_b), poses, index, xy_a, index + 1, xy_b, options
     )
+    return motions[0] if motions else None
 
 
-def estimate_rig_relative_pose(
+def estimate_rig_relative_poses(
     cameras: Sequence[RefractiveCamera],
     cam_from_rig: ArrayLike,
     camera_a: ArrayLike,
@@ -129,10 +135,12 @@ def estimate_rig_relative_pose(
     camera_b: ArrayLike,
     xy_b: ArrayLike,
     options: RelativePoseOptions | None = None,
-) -> RelativePose | None:
+) -> list[RelativePose]:
     """Find how a rig moved between two frames, from the matches of all image pairs.
 
-    Several cameras give the length of the motion too, from the rig's own lengths.
+    A scene that is nearly flat leaves two motions that explain its matches about
+    equally well: both are returned, and only other frames can tell. Several cameras
+    give the length of the motion too, from the rig's own lengths.
 
     Args:
         cameras: (C,) with their ports.
@@ -144,7 +152,8 @@ def estimate_rig_relative_pose(
         options: Defaults suit scenes within a few metres.
 
     Returns:
-        The pose, the same for the same seed; None if no pose has ``min_num_inliers``.
+        Poses, the best first, the same for the same seed; none if no pose has
+        ``min_num_inliers``.
 
     Raises:
         InputError: arrays of other shapes, or an index without a camera.
@@ -161,19 +170,20 @@ def estimate_rig_relative_pose(
     rays_b = rays_in_rig(near_b, index_b, poses)
     matches = (index_a, pixels_a, rays_a, index_b, pixels_b, rays_b)
     usable = finite_rows(rays_a) & finite_rows(rays_b)
-    best, best_error = None, np.inf
+    ends: list[tuple[float, Array]] = []
     for rows, a, b in image_pairs(index_a, index_b, usable):
         ransac = _ransac_options(options, (cameras[a], cameras[b]))
-        moved = central_pose(near_a[rows], near_b[rows], ransac)
-        if moved is None:
-            continue
-        line = MotionLine.through(moved, poses[a], poses[b], centres_a[a], centres_b[b])
-        for start in _lengths(line, matches, usable, rig, options):
-            pose = line.at(start)
-            error = _adjusted(pose, matches, usable, rig, options)
-            if error < best_error:
-                best, best_error = pose, error
-    return None if best is None else _refined(best, matches, usable, rig, options)
+        for moved in central_poses(near_a[rows], near_b[rows], ransac):
+            line = MotionLine.through(
+                moved, poses[a], poses[b], centres_a[a], centres_b[b]
+            )
+            for start in _lengths(line, matches, usable, rig, options):
+                pose = line.at(start)
+                ends.append((_adjusted(pose, matches, usable, rig, options), pose))
+    motions = (
+        _refined(pose, matches, usable, rig, options) for pose in distinct_ends(ends)
+    )
+    return [motion for motion in motions if motion is not None]
 
 
 def _ransac_options(

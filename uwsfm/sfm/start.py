@@ -21,7 +21,6 @@ from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import extract_features, store_intrinsics
 from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
 from uwsfm.sfm.images import Frames, check_masks, find_frames
-from uwsfm.sfm.mapper import map_images
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
@@ -34,6 +33,7 @@ from uwsfm.sfm.parallel import (
     workers_of,
 )
 from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
+from uwsfm.sfm.pinhole_search import search_models
 from uwsfm.sfm.refractive_steps import map_refractively
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
@@ -275,7 +275,8 @@ def _map(
     options: StartOptions,
     progress: Progress,
 ) -> None:
-    models = map_images(space.mapping, frames, options, progress=progress)
+    search = search_models(rig, frames, fixed, space, options, progress)
+    models = search.models
     if len(rig.cameras) == 1:
         _scale_to(models[0], options.scene_distance_m)
     best = models[0]
@@ -284,6 +285,8 @@ def _map(
         "num_points": best.num_points3D(),
         "num_observations": best.compute_num_observations(),
         "mean_error_px": best.compute_mean_reprojection_error(),
+        "num_starts": search.num_starts,
+        "noise_floor": None if search.floor is None else search.floor.summary(),
         **mapping_summary(
             rig,
             frames,

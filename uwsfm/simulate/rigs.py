@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import ArrayLike
 
+from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -73,6 +74,7 @@ def stereo_rig(
         cam_from_rig=np.stack([rigid3.IDENTITY, right_from_rig]),
         baseline_m=baseline,
         baseline_stddev_m=0.0,
+        accuracy=RigAccuracy(exact=True),
     )
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from uwsfm._indices import distinct
+from uwsfm._indices import distinct, renumbered
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
@@ -16,7 +18,12 @@ from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.observers import Chains, errors_px
 from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
 from uwsfm.sfm.mapping.triangulation import Views
+from uwsfm.sfm.noise_floor import NoiseFloor
 
+NUM_NEIGHBOURS = 5
+MAX_DEPTH_RATIO = 1.5
+"""Of a point that only two images see and its neighbours': on a reef 0.02 % of the
+points that more images see are farther off, and wrong matches are at any depth."""
 Mask = NDArray[np.bool_]
 
 MIN_PAIR_MATCHES = 15
@@ -54,6 +61,10 @@ class GrowingMap:
         self.chains = Chains.empty(num_keypoints)
         self.changes = np.zeros(num_frames, dtype=np.int64)
         """(F,) counts how often what a frame may see has changed."""
+        self.floor: NoiseFloor | None = None
+        """Of the finished map; None if too few matches tell."""
+        self.num_starts = 1
+        """Beginnings that were tried until this one was taken."""
         self._poses = np.zeros((num_frames * correspondences.num_cameras, 12))
         self._world_rays = np.full((2, num_keypoints, 3), np.nan)
         self._camera_rays = np.full((2, num_keypoints, 3), np.nan)
@@ -157,10 +168,12 @@ class GrowingMap:
         seen = np.concatenate([self.point_of[of.keypoints_of(f)] for f in frames])
         return distinct(seen[seen >= 0])
 
-    def counts(self) -> dict[str, float]:
+    def counts(self) -> dict[str, Any]:
         """For the report."""
         scene, _ = self.scene()
         return {
+            "num_starts": self.num_starts,
+            "noise_floor": None if self.floor is None else self.floor.summary(),
             "num_points": scene.num_points,
             "num_observations": scene.num_observations,
             "mean_error_px": float(
@@ -201,6 +214,45 @@ class GrowingMap:
         everything = np.arange(len(self.correspondences.matches))
         matches = self.consistent(everything, max_error_px)
         self._add_tracks(matches, max_error_px, min_images)
+
+    def add_pairs(self, max_error_px: float) -> None:
+        """Find points that two images see only, where points around them agree.
+
+        Two images always agree on their epipolar line, at whatever depth: the points
+        next to it in the first image show which depths are likely.
+        """
+        of, seen = self.correspondences, np.flatnonzero(self.point_of >= 0)
+        matches = self.consistent(np.arange(len(of.matches)), max_error_px)
+        new = np.all(self.point_of[of.matches[matches]] < 0, axis=1)
+        num_points = len(self.points)
+        self._add_tracks(matches[new], max_error_px)
+        alone = np.flatnonzero(self.point_of >= num_points)
+        odd = np.zeros(len(self.points), dtype=bool)
+        for image in distinct(of.image[alone]).tolist():
+            mine, sure = (rows[of.image[rows] == image] for rows in (alone, seen))
+            if len(sure) < NUM_NEIGHBOURS:
+                odd[self.point_of[mine]] = True
+                continue
+            _, near = cKDTree(of.xy[sure]).query(of.xy[mine], k=NUM_NEIGHBOURS)
+            likely = np.median(self._depths(image, sure)[near], axis=1)
+            ratio = self._depths(image, mine) / likely
+            strange = ~((ratio > 1.0 / MAX_DEPTH_RATIO) & (ratio < MAX_DEPTH_RATIO))
+            odd[self.point_of[mine[strange]]] = True
+        self.chains.unlink(alone[odd[self.point_of[alone]]])
+        self._drop_empty_points()
+
+    def _drop_empty_points(self) -> None:
+        """Number the points that keypoints see anew."""
+        seen = np.flatnonzero(self.point_of >= 0)
+        used, point_of = renumbered(self.point_of[seen], len(self.points))
+        self.points = self.points[used]
+        self.chains = Chains.empty(len(self.point_of)).with_room(len(used))
+        self._see(seen, point_of)
+
+    def _depths(self, image: int, keypoints: IndexArray) -> Array:
+        """Of the points (n,) that keypoints of an image see."""
+        points = self.points[self.point_of[keypoints]]
+        return rigid3.transform(self.cam_from_world(image), points)[:, 2]
 
     def extend(self, frame: int, max_error_px: float) -> None:
         """Let a registered frame see the points it matches, and find new ones."""

@@ -12,7 +12,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.epipolar import ray_pairs
 from uwsfm.sfm.mapping.growing_map import GrowingMap, Mask
-from uwsfm.sfm.relative_pose import estimate_rig_relative_pose
+from uwsfm.sfm.relative_pose import estimate_rig_relative_poses
 from uwsfm.sfm.relative_pose_options import RelativePoseOptions
 
 MIN_POINTS = 30
@@ -23,10 +23,14 @@ MIN_ERROR_PX = 4.0
 MAX_ERROR_PX = 30.0
 ALONE_ERROR_PX = 8.0
 """The tolerance at the start for one camera: no rig tells how wrong its port is."""
-PAIR_ANGLES_DEG = (8.0, 4.0, 2.0)
-"""Median angles between the rays of a first pair: the first one that a pair reaches."""
-MAX_PAIRS = 40
-"""With the most matches, that are looked at."""
+MIN_PAIR_ANGLE_DEG = 1.0
+"""Median, between the rays of a first pair: of some, points have a depth then."""
+WIDE_ANGLE_DEG = 8.0
+"""Beyond it a larger angle tells no more of the depth, and matches are rare."""
+PAIRS_OF_A_SEARCH = 20
+MAX_SEARCHES = 3
+MAX_START_MATCHES = 400
+"""Of a pair, which a motion is sought for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,46 +54,120 @@ def start_tolerance_px(empty: GrowingMap) -> float:
     return min(max(typical, MIN_ERROR_PX), MAX_ERROR_PX)
 
 
-def beginnings(
-    empty: GrowingMap,
-    left: Mask,
-    max_error_px: float,
-    scene_distance_m: float,
-    seed: int,
+def frame_beginnings(
+    empty: GrowingMap, left: Mask, max_error_px: float
 ) -> Iterator[Beginning]:
-    """Ways to begin, the best first.
-
-    Frames by the number of points that their own cameras and other frames see; if none
-    is left, pairs by their number of matches.
+    """Single frames of a rig, by the number of points that their own cameras and other
+    frames see.
 
     Args:
         empty: A map without frames.
         left: (F,) frames that no map has yet; read before each beginning.
         max_error_px: Tolerance.
-        scene_distance_m: How far away the scene is, about, where nothing tells.
-        seed: Of the random samples.
     """
     for frame in _ranked_frames(empty, max_error_px):
         if left[frame]:
             yield Beginning(
                 frames=np.array([frame]), rig_from_world=rigid3.IDENTITY[None]
             )
-    motions: dict[tuple[int, int], tuple[Array, float] | None] = {}
-    pairs = _ranked_pairs(empty)[:MAX_PAIRS]
-    for min_angle in np.radians(PAIR_ANGLES_DEG):
-        for a, b in pairs:
-            if not (left[a] and left[b]):
+
+
+class PairSearch:
+    """Pairs of frames to begin with.
+
+    The pairs with the most matches have hardly moved, those that moved most have hardly
+    any matches: pairs of all sorts are tried, and ranked by what they would tell of the
+    depth of their points.
+
+    Args:
+        empty: A map without frames.
+        left: (F,) frames that no map has yet; read at each search.
+        max_error_px: Tolerance.
+        scene_distance_m: How far away the scene is, about, where nothing tells.
+        seed: Of the random samples.
+    """
+
+    def __init__(
+        self,
+        empty: GrowingMap,
+        left: Mask,
+        max_error_px: float,
+        scene_distance_m: float,
+        seed: int,
+    ) -> None:
+        self.empty = empty
+        self.left = left
+        self.max_error_px = max_error_px
+        self.scene_distance_m = scene_distance_m
+        self.seed = seed
+        self.num_matched = 0
+        """Pairs that had enough matches."""
+        self.widest_angle = 0.0
+        """The largest median angle between the rays of one of them, radians."""
+
+    def beginnings(self) -> Iterator[Beginning]:
+        """Pairs, and both motions of a nearly flat one; the best of each search first,
+        then those of pairs that were not tried yet."""
+        ranked = _ranked_pairs(self.empty)
+        self.num_matched = len(ranked)
+        for _ in range(MAX_SEARCHES):
+            ranked = [pair for pair in ranked if self.left[list(pair[:2])].all()]
+            some = _spread(ranked)
+            ranked = [pair for pair in ranked if pair not in some]
+            found = [(s, w) for a, b, _ in some for s, w in self._motions(a, b)]
+            for _, beginning in sorted(found, key=lambda way: -way[0]):
+                if self.left[beginning.frames].all():
+                    yield beginning
+
+    def _motions(self, a: int, b: int) -> list[tuple[float, Beginning]]:
+        """Ways to begin with two frames, and how much each promises."""
+        empty, of = self.empty, self.empty.correspondences
+        matches = np.intersect1d(of.matches_of(a), of.matches_of(b))
+        ends = of.matches[matches[of.verified[matches]]]
+        ends = ends[(of.frame[ends] == [a, b]).all(axis=1)]
+        num_matches = len(ends)
+        if num_matches > MAX_START_MATCHES:
+            random = np.random.default_rng([self.seed, a, b])
+            ends = random.choice(ends, MAX_START_MATCHES, replace=False)
+        motions = estimate_rig_relative_poses(
+            empty.cameras,
+            empty.cam_from_rig,
+            of.camera[ends[:, 0]],
+            of.xy[ends[:, 0]],
+            of.camera[ends[:, 1]],
+            of.xy[ends[:, 1]],
+            RelativePoseOptions(
+                max_error_px=self.max_error_px,
+                min_num_inliers=MIN_POINTS,
+                scene_distance_m=self.scene_distance_m,
+                seed=self.seed,
+            ),
+        )
+        ways = []
+        for motion in motions:
+            angle, pose = motion.median_angle, motion.b_from_a.copy()
+            self.widest_angle = max(self.widest_angle, angle)
+            if angle < np.radians(MIN_PAIR_ANGLE_DEG):
                 continue
-            if (a, b) not in motions:
-                motions[a, b] = _motion(
-                    empty, a, b, max_error_px, scene_distance_m, seed
-                )
-            motion = motions[a, b]
-            if motion is not None and motion[1] >= min_angle:
-                yield Beginning(
-                    frames=np.array([a, b]),
-                    rig_from_world=np.stack([rigid3.IDENTITY, motion[0]]),
-                )
+            if len(empty.cameras) == 1 and not motion.length_determined:
+                distance = _scene_distance(empty, pose, ends)
+                pose[4:] *= self.scene_distance_m / distance
+            share = motion.num_inliers / len(ends)
+            told = min(angle, np.radians(WIDE_ANGLE_DEG)) ** 2
+            poses = np.stack([rigid3.IDENTITY, pose])
+            way = Beginning(frames=np.array([a, b]), rig_from_world=poses)
+            ways.append((share * num_matches * told, way))
+        return ways
+
+
+def _spread(ranked: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    """Some pairs, from the most matches to the fewest, in equal steps of a factor."""
+    if len(ranked) <= PAIRS_OF_A_SEARCH:
+        return ranked
+    counts = np.log([count for _, _, count in ranked])
+    wanted = np.linspace(counts[0], counts[-1], PAIRS_OF_A_SEARCH)
+    rows = np.unique([int(np.argmin(np.abs(counts - value))) for value in wanted])
+    return [ranked[row] for row in rows]
 
 
 def _same_frame(empty: GrowingMap) -> IndexArray:
@@ -120,48 +198,15 @@ def _ranked_frames(empty: GrowingMap, max_error_px: float) -> list[int]:
     return order[counts[order] >= MIN_POINTS].tolist()
 
 
-def _ranked_pairs(empty: GrowingMap) -> list[tuple[int, int]]:
+def _ranked_pairs(empty: GrowingMap) -> list[tuple[int, int, int]]:
+    """Two frames and the number of their verified matches, the most first."""
     of = empty.correspondences
     frames = of.frame[of.matches[of.verified]]
     keys = frames[:, 0] * np.int64(of.num_frames) + frames[:, 1]
     pairs, counts = np.unique(keys[frames[:, 0] != frames[:, 1]], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= MIN_POINTS]
-    return [divmod(int(pair), of.num_frames) for pair in pairs[order]]
-
-
-def _motion(
-    empty: GrowingMap,
-    a: int,
-    b: int,
-    max_error_px: float,
-    scene_distance_m: float,
-    seed: int,
-) -> tuple[Array, float] | None:
-    """Pose b_from_a (7,) of two frames, and the median angle of their rays."""
-    of = empty.correspondences
-    ends = of.matches[of.verified]
-    ends = ends[(of.frame[ends] == [a, b]).all(axis=1)]
-    found = estimate_rig_relative_pose(
-        empty.cameras,
-        empty.cam_from_rig,
-        of.camera[ends[:, 0]],
-        of.xy[ends[:, 0]],
-        of.camera[ends[:, 1]],
-        of.xy[ends[:, 1]],
-        RelativePoseOptions(
-            max_error_px=max_error_px,
-            min_num_inliers=MIN_POINTS,
-            scene_distance_m=scene_distance_m,
-            seed=seed,
-        ),
-    )
-    if found is None:
-        return None
-    motion = found.b_from_a.copy()
-    if len(empty.cameras) == 1 and not found.length_determined:
-        motion[4:] *= scene_distance_m / _scene_distance(empty, motion, ends)
-    return motion, found.median_angle
+    return [(*divmod(int(pairs[k]), of.num_frames), int(counts[k])) for k in order]
 
 
 def _scene_distance(empty: GrowingMap, b_from_a: Array, ends: IndexArray) -> float:

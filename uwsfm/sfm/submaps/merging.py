@@ -107,7 +107,8 @@ def merge_submaps(
         beginning, source = _poses(placement, submaps, chosen)
         seam_px = _seam_px(growing, beginning, source)
         grower.max_error_px = min(max(START_GAPS * seam_px, MIN_ERROR_PX), MAX_ERROR_PX)
-        grower.grow(beginning)
+        grower.begin(beginning)
+        grower.finish()
     return Merged(
         map=growing,
         sizes=[len(submap.frames) for submap in submaps],

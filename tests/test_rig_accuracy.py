@@ -1,0 +1,251 @@
+"""How well given numbers are known: read from a rig file, refused, written again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from given_changes import scaled_accuracy
+
+from uwsfm import calibrate
+from uwsfm.calibration import given_accuracy as defaults
+from uwsfm.calibration.error_budget import with_budget
+from uwsfm.calibration.given_accuracy import (
+    CameraAccuracy,
+    NamedCovariance,
+    RigAccuracy,
+)
+from uwsfm.calibration.tilt import paper_tilt
+from uwsfm.errors import InputError
+from uwsfm.export.housing import export_housing
+from uwsfm.models.port import FlatPort
+from uwsfm.residuals import border
+from uwsfm.rig_file import dump_rig, load_rig, template
+from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
+from uwsfm.simulate.rigs import sample_rig
+from uwsfm.simulate.trajectories import rich_motion
+
+NAMES = ["left.fx", "left.k1", "right.fx", "right.rotation_z"]
+ROOT = np.diag([1.0, 0.01, 2.0, 1e-3]) @ np.linalg.cholesky(
+    0.5 * np.eye(4) + 0.5 * np.ones((4, 4))
+)
+MATRIX = (ROOT @ ROOT.T).tolist()
+
+
+def _file(folder, shared=None, left=None, right=None):
+    data = yaml.safe_load(template())
+    if shared is not None:
+        data["accuracy"] = shared
+    for camera, own in zip(data["cameras"], (left, right), strict=True):
+        if own is not None:
+            camera["accuracy"] = own
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def _stddevs(rig):
+    return rig.given_accuracy().stddevs
+
+
+def test_what_is_given_arrives_and_the_rest_is_assumed(tmp_path):
+    shared = {"baseline_m": 2e-3, "water_index": 1e-3}
+    left = {
+        "focal": 2e-3,
+        "principal_point_px": 0.5,
+        "distortion": [1e-3, 2e-3, 3e-4, 4e-4],
+        "thickness_m": 1e-4,
+        "glass_index": 2e-3,
+    }
+    right = {"normal_deg": 1.0, "distance_m": 1e-3, "rotation_deg": 0.05}
+    rig = load_rig(_file(tmp_path, shared, left, right))
+    accuracy = rig.given_accuracy()
+    stddevs, assumed, lens = accuracy.stddevs, accuracy.assumed, border.FIRST_LENS
+    expected = [2.8, 2.8, 0.5, 0.5, 1e-3, 2e-3, 3e-4, 4e-4]
+    np.testing.assert_allclose(stddevs[0, lens : lens + 8], expected)
+    assert not assumed[0, lens : lens + 8].any() and assumed[1, lens : lens + 8].all()
+    assert stddevs[0, border.THICKNESS] == 1e-4 and stddevs[0, 11] == 2e-3
+    assert stddevs[1, border.LENGTH] == 2e-3 and stddevs[1, border.WATER_INDEX] == 1e-3
+    # An RMS angle is sqrt(2) of one component; a rotation is given per axis.
+    np.testing.assert_allclose(
+        stddevs[1, border.NORMAL], np.radians(1.0) / np.sqrt(2.0)
+    )
+    np.testing.assert_allclose(stddevs[1, border.ROTATION], np.radians(0.05))
+    direction = np.radians(defaults.DIRECTION_DEG)
+    np.testing.assert_allclose(stddevs[1, border.DIRECTION], direction)
+    assert assumed[1, border.DIRECTION].all()
+    # Both ports look into one water.
+    size = border.BORDER_SIZE
+    both = accuracy.covariance[border.WATER_INDEX, size + border.WATER_INDEX]
+    assert both == pytest.approx(1e-6)
+
+
+def test_a_covariance_replaces_single_deviations_and_may_be_a_file(tmp_path):
+    block = {"names": NAMES, "matrix": MATRIX}
+    (tmp_path / "c.json").write_text(json.dumps(block), encoding="utf-8")
+    np.savez(tmp_path / "c.npz", names=np.array(NAMES), matrix=np.array(MATRIX))
+    slots = [(0, 13), (0, 17), (1, 13), (1, 2)]
+    for covariance in (block, "c.json", "c.npz"):
+        accuracy = load_rig(
+            _file(tmp_path, {"covariance": covariance})
+        ).given_accuracy()
+        np.testing.assert_allclose(accuracy.block(slots), MATRIX, rtol=1e-12)
+        assert not accuracy.assumed[tuple(np.transpose(slots))].any()
+        # What is not named keeps its default, without correlation to the named.
+        assert accuracy.assumed[0, 14] and accuracy.stddevs[0, 14] > 0.0
+        assert accuracy.block([(0, 13), (0, 14)])[0, 1] == 0.0
+
+
+def test_the_covariance_of_a_translation_is_that_of_direction_and_length(tmp_path):
+    names = [f"right.translation_{axis}" for axis in "xyz"]
+    block = {"names": names, "matrix": np.diag([4e-6, 1e-8, 1e-8]).tolist()}
+    stddevs = _stddevs(load_rig(_file(tmp_path, {"covariance": block})))
+    # The baseline of the template is 0.2 m along -x.
+    assert stddevs[1, border.LENGTH] == pytest.approx(2e-3)
+    np.testing.assert_allclose(stddevs[1, border.DIRECTION], 1e-4 / 0.2)
+
+
+def test_accuracy_survives_the_file(tmp_path):
+    covariance = NamedCovariance(names=tuple(NAMES), matrix=np.array(MATRIX))
+    rig = sample_rig()
+    own = CameraAccuracy(focal=2e-3, distortion=(1e-3, 2e-3, 1e-4, 1e-4))
+    cameras = (replace(rig.cameras[0], accuracy=own), rig.cameras[1])
+    for shared in (
+        RigAccuracy(exact=True),
+        RigAccuracy(baseline_m=1e-3, covariance=covariance, lens_prior="correlated"),
+    ):
+        before = replace(rig, cameras=cameras, accuracy=shared)
+        dump_rig(before, tmp_path / "rig.yaml")
+        after = load_rig(tmp_path / "rig.yaml")
+        ours, theirs = before.given_accuracy(), after.given_accuracy()
+        np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-9)
+        assert np.array_equal(ours.assumed, theirs.assumed)
+        assert ours.correlated_prior == theirs.correlated_prior
+
+
+def test_exact_is_everything_that_has_no_deviation(tmp_path):
+    rig = load_rig(_file(tmp_path, "exact", {"distance_m": 1e-3}))
+    stddevs = _stddevs(rig)
+    assert stddevs[0, border.DISTANCE] == 1e-3
+    assert np.count_nonzero(stddevs) == 1
+
+
+def _with(row, column, value):
+    matrix = np.array(MATRIX)
+    matrix[row, column] = value
+    return {"names": NAMES, "matrix": matrix.tolist()}
+
+
+REFUSED = {
+    "cameras[0].accuracy.focal: must be at least 0": {"left": {"focal": -1e-3}},
+    "cameras[0].accuracy.focal: must be a finite": {"left": {"focal": float("nan")}},
+    "accuracy.focl: unknown key, did you mean focal?": {"left": {"focl": 1e-3}},
+    "accuracy.distortion has 2 values, its lens model has 4": {
+        "left": {"distortion": [0.1, 0.1]}
+    },
+    "accuracy.baseline_mm: unknown key, did you mean baseline_m": {
+        "shared": {"baseline_mm": 1.0}
+    },
+    "accuracy: must be 'exact'": {"shared": "perfect"},
+    "matrix: is not symmetric": {"shared": {"covariance": _with(0, 1, 0.0)}},
+    "matrix: is not positive definite": {
+        "shared": {"covariance": {"names": NAMES[:2], "matrix": [[1, 2], [2, 1]]}}
+    },
+    "matrix: the variance of left.fx is not positive": {
+        "shared": {"covariance": _with(0, 0, -1.0)}
+    },
+    "matrix: must be 4 x 4": {
+        "shared": {"covariance": {"names": NAMES, "matrix": [[1.0]]}}
+    },
+    "names: 'left.fx' is there twice": {
+        "shared": {"covariance": {"names": 4 * NAMES[:1], "matrix": MATRIX}}
+    },
+    "'left.k9' is no parameter; those of left are fx": {
+        "shared": {"covariance": {"names": ["left.k9"], "matrix": [[1.0]]}}
+    },
+    "'up.fx' is of no camera of this rig": {
+        "shared": {"covariance": {"names": ["up.fx"], "matrix": [[1.0]]}}
+    },
+    "translation of right needs x, y and z": {
+        "shared": {"covariance": {"names": ["right.translation_x"], "matrix": [[1.0]]}}
+    },
+    "accuracy.covariance: there is no file": {"shared": {"covariance": "none.json"}},
+    "is neither .json nor .npz": {"shared": {"covariance": "rig.yaml"}},
+    "is damaged, or no .json file": {"shared": {"covariance": "broken.json"}},
+    "needs the keys names and matrix": {"shared": {"covariance": "other.json"}},
+    "is damaged, or no .npz file": {"shared": {"covariance": "pickled.npz"}},
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_impossible_accuracies_are_refused_in_one_sentence(tmp_path, words):
+    (tmp_path / "broken.json").write_text("{", encoding="utf-8")
+    (tmp_path / "other.json").write_text("[1, 2]", encoding="utf-8")
+    np.savez(tmp_path / "pickled.npz", names=np.array([{}]), matrix=np.eye(1))
+    path = _file(tmp_path, **REFUSED[words])
+    with pytest.raises(InputError) as error:
+        load_rig(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ") and words in text and "\n" not in text
+
+
+@pytest.fixture(scope="module")
+def solved():
+    options = ObservationOptions(num_points=120, noise_px=0.2, seed=2)
+    dive = simulate_scene(sample_rig(), rich_motion(6), Relief(stddev=0.2), options)
+    given = scaled_accuracy(dive.truth, 0.1)
+    return with_budget(calibrate(perturbed(dive.scene), loss="l2", given=given))[0]
+
+
+def test_estimates_that_no_housing_has_are_read_back_from_a_result(tmp_path, solved):
+    """A lens calibrated in the water ends at ports of half a metre: the adjustment may,
+    and its own file must be readable. What a person writes is still held against it."""
+    rig, path = sample_rig(), tmp_path / "housing.yaml"
+    ports = [replace(camera.port, distance=0.536) for camera in rig.cameras]
+    rig = rig.with_geometry(rig.cam_from_rig, ports)
+    export_housing(rig, path, solved)
+    assert load_rig(path).cameras[1].port.distance == 0.536
+    dump_rig(rig, path)
+    with pytest.raises(InputError, match="0.536 m is not a port distance"):
+        load_rig(path)
+
+
+def test_a_housing_file_says_how_well_its_ports_are_known(tmp_path, solved):
+    rig = sample_rig().with_geometry(solved.scene.cam_from_rig, solved.scene.ports)
+    path = tmp_path / "housing.yaml"
+    export_housing(rig, path, solved)
+    known = solved.covariance.in_all.cameras
+    for camera, item in zip(load_rig(path).cameras, known, strict=True):
+        # Four digits are written.
+        assert camera.accuracy.distance_m == pytest.approx(
+            item.distance_stddev_m, rel=1e-3
+        )
+        assert camera.accuracy.normal_deg == pytest.approx(
+            item.normal_stddev_deg, rel=1e-3
+        )
+    text = path.read_text(encoding="utf-8")
+    assert "from the images, " in text and "in all: " in text
+
+
+def test_azimuth_and_tilt_are_the_normal_and_share_its_deviation(solved):
+    """The paper's two angles: they make the normal again, and their deviations the RMS
+    angle, whose parts they are."""
+    covariance = solved.covariance
+    for c in range(2):
+        port, known = solved.scene.ports[c], paper_tilt(solved, c)
+        assert isinstance(port, FlatPort)
+        theta, phi = np.radians([known.tilt_deg, known.azimuth_deg])
+        rebuilt = [
+            np.sin(theta) * np.cos(phi),
+            np.sin(theta) * np.sin(phi),
+            np.cos(theta),
+        ]
+        np.testing.assert_allclose(rebuilt, port.normal, atol=1e-12)
+        stddev = np.radians(covariance.in_all.cameras[c].normal_stddev_deg)
+        assert np.hypot(
+            np.radians(known.tilt_stddev_in_all_deg),
+            np.sin(theta) * np.radians(known.azimuth_stddev_in_all_deg),
+        ) == pytest.approx(stddev, rel=1e-6)
+        assert known.tilt_stddev_deg < known.tilt_stddev_in_all_deg
+        assert known.azimuth_stddev_deg < known.azimuth_stddev_in_all_deg
