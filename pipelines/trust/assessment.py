@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.pipeline import refined_verdict
 from uwsfm.rig import Rig
 from uwsfm.sfm.refine import Refined
-from uwsfm.trust.diagnosis import diagnose
-from uwsfm.trust.verdict import FITS
+from uwsfm.trust.diagnosis import explain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,12 @@ def with_deviations(refined: Refined) -> Refined:
 
 
 def assessed(
-    rig: Rig, refined: Refined, num_frames: int, *, diagnosed: bool
+    rig: Rig,
+    refined: Refined,
+    num_frames: int,
+    frame_names: Sequence[str],
+    *,
+    diagnosed: bool,
 ) -> Assessment:
     """Judge a result; where it does not simply fit, look for the cause.
 
@@ -38,13 +43,14 @@ def assessed(
         rig: As given.
         refined: The result.
         num_frames: That there were, registered or not.
+        frame_names: Of those that are.
         diagnosed: False: look for no cause, which takes some seconds.
     """
     verdict = refined_verdict(rig, refined, num_frames)
     reasons = [f"{reason.code}: {reason.text}" for reason in verdict.reasons]
     causes: tuple[str, ...] = ()
-    if diagnosed and verdict.verdict != FITS:
-        found = diagnose(rig, refined.scene)
+    if diagnosed:
+        found = explain(verdict.verdict, rig, refined.calibration, frame_names)
         causes = tuple(one.code for one in found)
         reasons += [one.text for one in found]
     return Assessment(verdict=verdict.verdict, words=" ".join(reasons), causes=causes)

@@ -130,7 +130,8 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
                 seconds=time.perf_counter() - clock,
             )
         num_frames = len(frames.names)
-        found = assessed(rig, refined, num_frames, diagnosed=diagnosed)
+        names = arrays.frame_names
+        found = assessed(rig, refined, num_frames, names, diagnosed=diagnosed)
     true_points = points_of_truth(dive, arrays, refined)
     errors, z_scores = errors_of(rig, refined, dive.true_rig, true_points)
     return Outcome(
