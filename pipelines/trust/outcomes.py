@@ -34,6 +34,8 @@ from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate.rigs import known_cam_from_rig
 
+OPTIONS = StartOptions(mapper="refractive")
+"""As `uwsfm.reconstruct` has them."""
 REFUSED, FITS = "refused", "fits"
 LIMIT = 3.0
 """Printed standard deviations; an error beyond them must not come with "fits"."""
@@ -117,7 +119,7 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True) -> Outcome:
             rig = load_rig(work / "rig.yaml")
             dive.write_database(work / "database.db")
             frames = dive.frames(work)
-            start = start_from_matches(rig, frames, Steps(work), "", StartOptions())
+            start = start_from_matches(rig, frames, Steps(work), "", OPTIONS)
             arrays = start.arrays()
             refined = refine_scene(start_scene(rig, start, arrays), rig)
             refined = with_deviations(refined)
