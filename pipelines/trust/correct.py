@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from dives import WRONG_MATCHES, Dive, dive_of
+from dives import WRONG_MATCHES, Dive, dive_of, points_of
 from outcomes import FITS, LIMIT, outcome_of
 
 from uwsfm._files import replaced_file
@@ -79,6 +79,7 @@ def correct_dive(seed: int) -> tuple[Dive, dict[str, Any]]:
             path, scene, names, wrong=WRONG_MATCHES, seed=seed
         ),
     )
+    dive = replace(dive, points=points_of(scene, dive.images))
     drawn = {
         "cameras": num_cameras,
         "ports": ports,
@@ -230,6 +231,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--runs", type=int, default=RUNS)
+    parser.add_argument(
+        "--mapped", action="store_true", help="verify and map each dive: slow"
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     stored = options.out / "correct.jsonl"
@@ -241,7 +245,11 @@ def main() -> None:
         for number, seed in enumerate(seeds):
             progress("runs", number, len(seeds))
             dive, drawn = correct_dive(seed)
-            row = {"seed": seed, **drawn, **outcome_of(dive).to_json()}
+            row = {
+                "seed": seed,
+                **drawn,
+                **outcome_of(dive, mapped=options.mapped).to_json(),
+            }
             rows.append(row)
             file.write(json.dumps(row) + "\n")
             file.flush()

@@ -18,7 +18,7 @@ from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort
 from uwsfm.rig import Rig
-from uwsfm.scene import IndexArray
+from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.background import opened
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.simulated import frames_of, write_features
@@ -49,6 +49,8 @@ class Dive:
     """(K, 2) pixels, COLMAP's origin."""
     seen: dict[ImageKey, Array]
     """(K, 2) where the same keypoints were in the image as it was taken."""
+    points: dict[ImageKey, IndexArray]
+    """(K,) which point of the sea floor each keypoint is of; -1: not known."""
     taken: dict[ImageKey, ImageKey]
     """Which camera took an image, in which frame of ``true_poses``."""
     matches: dict[tuple[ImageKey, ImageKey], IndexArray]
@@ -137,8 +139,17 @@ def simulated_dive(
             path, scene, frames, wrong=WRONG_MATCHES, seed=seed
         ),
     )
+    dive = replace(dive, points=points_of(scene, dive.images))
     # Noise moves some of them out of their image, where no feature is found.
     return with_keypoints_moved(dive, lambda c, f, xy: xy, (0, 1))
+
+
+def points_of(scene: Scene, images: list[ImageKey]) -> dict[ImageKey, IndexArray]:
+    """The point of each keypoint, in the order of `write_features`."""
+    return {
+        (c, f): scene.point_idx[(scene.camera_idx == c) & (scene.frame_idx == f)]
+        for c, f in images
+    }
 
 
 def dive_of(
@@ -183,6 +194,7 @@ def read_dive(
         names=frames.names,
         keypoints=keypoints,
         seen=keypoints,
+        points={key: np.full(len(xy), -1) for key, xy in keypoints.items()},
         taken={key: key for key in images},
         matches=matches,
     )
@@ -198,7 +210,7 @@ def with_keypoints_moved(
         move: Gives the new pixels (K, 2) of camera and frame; not finite: lost.
         cameras: Whose images change.
     """
-    moved, seen, kept = {}, {}, {}
+    moved, seen, points, kept = {}, {}, {}, {}
     for (c, f), xy in dive.keypoints.items():
         new = move(c, f, xy) if c in cameras else xy
         lens = dive.rig.cameras[c].camera
@@ -206,8 +218,9 @@ def with_keypoints_moved(
             inside = (new >= 0.0) & (new <= [lens.width, lens.height])
         keep = inside.all(axis=1) if c in cameras else np.ones(len(xy), dtype=bool)
         moved[c, f], seen[c, f] = new[keep], dive.seen[c, f][keep]
-        kept[c, f] = keep
-    return replace(dive, keypoints=moved, seen=seen, matches=_matches_of(dive, kept))
+        points[c, f], kept[c, f] = dive.points[c, f][keep], keep
+    matches = _matches_of(dive, kept)
+    return replace(dive, keypoints=moved, seen=seen, points=points, matches=matches)
 
 
 def _matches_of(
@@ -257,6 +270,7 @@ def renamed(dive: Dive, place: dict[ImageKey, ImageKey]) -> Dive:
         dive,
         keypoints={new: dive.keypoints[old] for old, new in place.items()},
         seen={new: dive.seen[old] for old, new in place.items()},
+        points={new: dive.points[old] for old, new in place.items()},
         taken={new: dive.taken[old] for old, new in place.items()},
         matches=matches,
     )

@@ -2,7 +2,7 @@
 
     python pipelines/trust/matrix.py -o OUT [--only TEXT] [--images FOLDER]
 
-Simulated keypoints and matches by default. ``--images``: features of rendered images,
+Simulated keypoints and matches by default, without mapping; ``--mapped``: with it. ``--images``: features of rendered images,
 which are made in FOLDER and found once. A run that was stopped goes on.
 """
 
@@ -35,6 +35,8 @@ class Case:
     dive: str
     trial: int
     images: Path | None = None
+    mapped: bool = False
+    """Verify and map, too."""
     causes: bool = True
     """Look for the cause of what does not fit; a refusal names its own."""
 
@@ -48,7 +50,8 @@ class Case:
             text = str(error)
             outcome = Outcome(verdict=REFUSED, words=text, causes=causes_in(text))
         else:
-            outcome = outcome_of(wrong, diagnosed=self.causes)
+            mapped = self.mapped or self.images is not None
+            outcome = outcome_of(wrong, diagnosed=self.causes, mapped=mapped)
         return {
             "mistake": self.mistake,
             "code": mistake.code,
@@ -176,6 +179,9 @@ def main() -> None:
     parser.add_argument(
         "--without-causes", action="store_true", help="only the verdicts: faster"
     )
+    parser.add_argument(
+        "--mapped", action="store_true", help="verify and map each case: slow"
+    )
     parser.add_argument("--images", type=Path, help="folder of rendered images")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -190,6 +196,7 @@ def main() -> None:
             dive=dive,
             trial=trial,
             images=options.images,
+            mapped=options.mapped,
             causes=not options.without_causes,
         )
         for trial in range(options.trials)
