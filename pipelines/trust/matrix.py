@@ -2,8 +2,9 @@
 
     python pipelines/trust/matrix.py -o OUT [--only TEXT] [--images FOLDER]
 
-Simulated keypoints and matches by default, without mapping; ``--mapped``: with it. ``--images``: features of rendered images,
-which are made in FOLDER and found once. A run that was stopped goes on.
+Simulated keypoints and matches by default, without mapping; ``--mapped``: with it.
+``--images``: features of rendered images, which are made in FOLDER and found once. A run
+that was stopped goes on.
 """
 
 from __future__ import annotations
