@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm.errors import InputError
+from uwsfm.errors import ExplainedInputError, InputError
 
 FOLDER = Path(__file__).parent.parent / "pipelines" / "trust"
 sys.path.insert(0, str(FOLDER))
@@ -18,7 +18,7 @@ from outcomes import (  # noqa: E402
     LIMIT,
     REFUSED,
     Outcome,
-    causes_in,
+    causes_of,
     outcome_of,
     relative_size,
 )
@@ -88,14 +88,13 @@ def test_correct_inputs_are_drawn_from_what_is_promised():
     assert len({row["cameras"] for row in drawn}) > 1
 
 
-def test_hints_at_everything_name_nothing():
+def test_a_refusal_without_a_cause_names_nothing():
     hint = "check its rotation (order x, y, z, w), and that images were taken together"
-    assert causes_in(f"cam_from_rig is wrong by several degrees; {hint}") == ()
-    text = "contradict their images: probably the images are mirrored, top to bottom"
-    assert causes_in(text) == ("mirrored",)
-    assert causes_in("20 m is not a port distance; did you mean 0.02?") == (
-        "length_unit",
-    )
+    assert causes_of(InputError(f"cam_from_rig is wrong; {hint}")) == ()
+    explained = ExplainedInputError("probably mirrored", ("mirrored",))
+    assert causes_of(explained) == ("mirrored",)
+    unit = InputError("20 m is not a port distance; did you mean 0.02?")
+    assert causes_of(unit) == ("length_unit",)
 
 
 def test_the_size_of_points_is_their_factor(rng):

@@ -3,8 +3,8 @@
     python pipelines/trust/matrix.py -o OUT [--only TEXT] [--images FOLDER]
 
 Simulated keypoints and matches by default, without mapping; ``--mapped``: with it.
-``--images``: features of rendered images, which are made in FOLDER and found once. A run
-that was stopped goes on.
+``--images``: features of rendered images, which are made in FOLDER and found once. A
+run that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from dives import Dive, simulated_dive
 from images import rendered_dive
-from outcomes import FITS, REFUSED, Outcome, causes_in, outcome_of
+from outcomes import FITS, REFUSED, Outcome, causes_of, outcome_of
 from wrong_inputs import MISTAKES, Mistake
 
 from uwsfm._files import replaced_file
@@ -48,8 +48,9 @@ class Case:
         try:
             wrong = mistake.applied(right, self.trial)
         except InputError as error:  # the rig file cannot hold such numbers
-            text = str(error)
-            outcome = Outcome(verdict=REFUSED, words=text, causes=causes_in(text))
+            outcome = Outcome(
+                verdict=REFUSED, words=str(error), causes=causes_of(error)
+            )
         else:
             mapped = self.mapped or self.images is not None
             outcome = outcome_of(wrong, diagnosed=self.causes, mapped=mapped)
@@ -189,7 +190,11 @@ def main() -> None:
     stem = "matrix_images" if options.images else "matrix"
     stored = options.out / f"{stem}.jsonl"
     rows = _stored(stored)
-    done = {(row["mistake"], row["dive"], row["trial"]) for row in rows}
+    done = {
+        _key(row)
+        for row in rows
+        if row["looked"] or row["verdict"] == FITS or options.without_causes
+    }
     chosen = [m.name for m in MISTAKES if (options.only or "") in m.name]
     cases = [
         Case(
@@ -205,16 +210,21 @@ def main() -> None:
         for name in chosen
         if (name, dive, trial) not in done
     ]
-    with ProgressBars() as progress, stored.open("a", encoding="utf-8") as file:
+    with ProgressBars() as progress:
         for number, case in enumerate(cases):
             progress("runs", number, len(cases))
-            rows.append(case.run())
-            file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
+            row = case.run()  # in place of one whose cause was not looked for
+            rows = [other for other in rows if _key(other) != _key(row)] + [row]
+            with replaced_file(stored) as partial:
+                partial.write_text("".join(json.dumps(r) + "\n" for r in rows))
     text = page(rows, images=options.images is not None)
     with replaced_file(options.out / f"{stem}.md") as partial:
         partial.write_text(text, encoding="utf-8")
     print(text)
+
+
+def _key(row: dict[str, Any]) -> tuple[str, str, int]:
+    return row["mistake"], row["dive"], row["trial"]
 
 
 def _stored(path: Path) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist
 
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.propagation import Propagation
-from uwsfm.errors import UwsfmError
+from uwsfm.errors import ExplainedInputError, UwsfmError
 from uwsfm.export.summary import housing_summary, scale_summary
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -44,30 +44,6 @@ WRONG_TRACKS = 0.05
 """Observations of another point, as matches that were not found out."""
 NUM_LENGTHS = 5
 """Long distances between points that are compared."""
-NAMED = {
-    "port_none": r"was calibrated in the water(?!, not)",
-    "port_missing": r"port of .* is missing",
-    "undistorted": r"undistorted already",
-    "rotation_transposed": r"rotation of .* transposed",
-    "pose_inverted": r"inverted",
-    "translation_sign": r"is the position of the camera|sign of (the )?translation",
-    "quaternion_order": r"quaternion|w, x, y, z",
-    "principal_point": r"principal point of",
-    "focal": r"focal length of",
-    "resolution": r"another resolution",
-    "distortion_order": r"distortion of .* read as",
-    "distortion_sign": r"distortion of .* sign changed",
-    "fisheye": r"as (OPENCV|OPENCV_FISHEYE) with the same numbers",
-    "dome_as_flat": r"a dome in place of",
-    "flat_as_dome": r"a flat port in place of",
-    "folders_swapped": r"folders .* are swapped",
-    "mirrored": r"mirrored",
-    "frames_shifted": r"frames? (late|early)",
-    "length_unit": r"in another unit|unit of",
-    "baseline": r"another baseline",
-    "water_index": r"refractive index of",
-}
-"""Causes that a refusal names, by its words after "probably"."""
 AT_READING = {
     "length_unit": r"did you mean|are in metres",
     "resolution": r"puts the principal point outside",
@@ -132,7 +108,7 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True, mapped: bool = False) -> O
             return Outcome(
                 verdict=REFUSED,
                 words=text,
-                causes=causes_in(text),
+                causes=causes_of(error),
                 seconds=time.perf_counter() - clock,
             )
         names = [dive.names[f] for f in start.frames]
@@ -222,19 +198,12 @@ def taken_pose(dive: Dive, image: ImageKey) -> Array:
     )
 
 
-def causes_in(text: str) -> tuple[str, ...]:
-    """Codes of the causes that a refusal names, in the order of its words.
-
-    Hints at all that could be wrong name nothing: what is meant follows "probably".
-    """
-    _, probably, named = text.partition("probably ")
-    patterns = NAMED if probably else AT_READING
-    places = {
-        code: match.start()
-        for code, pattern in patterns.items()
-        if (match := re.search(pattern, named or text))
-    }
-    return tuple(sorted(places, key=lambda code: places[code]))
+def causes_of(error: UwsfmError) -> tuple[str, ...]:
+    """Codes of the causes that a refusal names, the likeliest first."""
+    if isinstance(error, ExplainedInputError):
+        return error.codes
+    patterns = AT_READING.items()
+    return tuple(code for code, pattern in patterns if re.search(pattern, str(error)))
 
 
 def errors_of(
