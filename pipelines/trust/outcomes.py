@@ -83,7 +83,13 @@ class Outcome:
         return asdict(self)
 
 
-def outcome_of(dive: Dive, *, diagnosed: bool = True, mapped: bool = False) -> Outcome:
+def outcome_of(
+    dive: Dive,
+    *,
+    diagnosed: bool = True,
+    mapped: bool = False,
+    wrong: float = WRONG_TRACKS,
+) -> Outcome:
     """Run the steps of ``uwsfm reconstruct`` from the matches on, and judge them.
 
     Args:
@@ -92,6 +98,7 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True, mapped: bool = False) -> O
         mapped: Verify the matches and map them, as `uwsfm.reconstruct` does. False: the
             rig is checked against the matches, then adjusted from the true poses with
             the true tracks, some of them wrong: the same end in a tenth of the time.
+        wrong: Share of the observations that are of another point; if not mapped.
     """
     clock = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -100,8 +107,11 @@ def outcome_of(dive: Dive, *, diagnosed: bool = True, mapped: bool = False) -> O
             dump_rig(dive.rig, work / "rig.yaml")
             rig = load_rig(work / "rig.yaml")
             dive.write_database(work / "database.db")
-            begin = mapped_scene if mapped else simulated_scene
-            start = begin(rig, dive, work)
+            start = (
+                mapped_scene(rig, dive, work)
+                if mapped
+                else simulated_scene(rig, dive, work, wrong)
+            )
             refined = with_deviations(refine_scene(start.scene, rig))
         except UwsfmError as error:
             text = str(error).replace(str(work), "OUT")
@@ -151,7 +161,7 @@ def mapped_scene(rig: Rig, dive: Dive, work: Path) -> Begun:
     )
 
 
-def simulated_scene(rig: Rig, dive: Dive, work: Path) -> Begun:
+def simulated_scene(rig: Rig, dive: Dive, work: Path, wrong: float) -> Begun:
     """The rig checked against the matches; then true poses, and tracks."""
     given = known_cam_from_rig(rig)
     fixed = fix_rig(rig, given, dive.frames(work), work / "database.db", 1.0)
@@ -163,8 +173,8 @@ def simulated_scene(rig: Rig, dive: Dive, work: Path) -> Begun:
     ]
     table = np.array(keypoints, dtype=np.int64)
     rng = np.random.default_rng(0)
-    wrong = np.flatnonzero(rng.random(len(table)) < WRONG_TRACKS)
-    table[wrong, 3] = np.roll(table[wrong, 3], 1)
+    moved = np.flatnonzero(rng.random(len(table)) < wrong)
+    table[moved, 3] = np.roll(table[moved, 3], 1)
     # One point once in an image: of two, the second is left out.
     _, first = np.unique(table[:, [0, 1, 3]], axis=0, return_index=True)
     table = table[np.sort(first)]
