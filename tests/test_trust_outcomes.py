@@ -59,6 +59,7 @@ def test_a_refusal_names_the_mistake(flat, name, code):
     assert code in outcome.causes
 
 
+@pytest.mark.slow
 def test_a_lens_of_another_sign_does_not_fit_and_is_named(flat):
     outcome = run(flat, "radial distortion negative", diagnosed=True)
     assert outcome.verdict == "does not fit"
