@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 import uwsfm
-from uwsfm.demo import run_demo, sample_dir
+from uwsfm.demo import MAX_FEATURES, run_demo, sample_dir
 from uwsfm.evaluate import Comparison
 from uwsfm.pipeline import ReconstructResult
 
@@ -108,6 +108,7 @@ def test_second_run_starts_from_what_is_on_disk(demo):
         sample / "rig.yaml",
         sample / "images",
         out,
+        max_features=MAX_FEATURES,
         progress=lambda step, done, total: steps.append(step),
         report=False,
     )

@@ -124,6 +124,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
         "images": "images",
         "out": "out",
         "clahe": True,
+        "max_features": 3000,
         "masks": None,
         "matching": "sequential",
         "matcher": "colmap",
@@ -146,6 +147,7 @@ def test_the_command_is_one_that_the_program_takes(tmp_path):
     parsed = typer.main.get_command(app).commands[command].make_context(command, words)
     found = parsed.params
     assert found["rig"] == asked["rig"] and found["clahe"] is True
+    assert found["max_features"] == 3000
     assert found["matching"] == "sequential" and found["seed"] == 3
     assert found["report"] is False and found["threads"] == -1
     assert found["lever_arm"] == "-0.2,0,1.5" and found["scene_distance"] == 2.5

@@ -191,10 +191,18 @@ class Run:
         )
 
     def prune(self, state: State, sigma_px: float) -> NDArray[np.bool_]:
-        """Mask (N,) of the observations within prune_sigma of their projections."""
+        """Mask (N,) of the observations within prune_sigma of their projections.
+
+        A point moves to its observations: of the noise of n it leaves (2n - 3) / 2n,
+        half of the gap between two. Fewer dimensions have longer tails: the cube root
+        cuts off as many of two observations as the whole limit of many.
+        """
         limit = self.settings.prune_sigma * max(sigma_px, MIN_NOISE_PX)
+        counts = np.bincount(self.scene.point_idx, minlength=self.scene.num_points)
+        limits = limit * np.cbrt(1.0 - 1.5 / np.maximum(counts, 2))
         residuals = state.to_scene(self.scene).residuals()
-        keep = np.sum(residuals**2, axis=1) <= limit**2  # NaN compares false
+        squares = np.sum(residuals**2, axis=1)
+        keep = squares <= limits[self.scene.point_idx] ** 2  # NaN compares false
         keep[self.outside.lengths.clicked] = True
         return keep
 

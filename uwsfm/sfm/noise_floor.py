@@ -63,8 +63,10 @@ lens and tilt of the port, which between them bend an image in any smooth way.""
 GRID = 3
 SUSPICIOUS = 1.5
 """Ratio above which pairs look for their poses themselves, which takes seconds."""
+MAX_OWN_PAIRS = 12
 OWN_ERROR_PX, OWN_NOISE_PX = 8.0, 1.0
-"""Then: the tolerance, and the noise to begin with. The lens may be a guess."""
+"""Then: how many do, the tolerance, and the noise to begin with. The lens may be a
+guess."""
 
 
 class PairGaps(NamedTuple):
@@ -132,7 +134,8 @@ def noise_floor(
     if found is None or found.ratio < SUSPICIOUS:
         return found
     # The poses of a wrong map may lead its pairs astray, too: they look for their own.
-    alone = [(rows, _pair_gaps(scene, rows, own_start=True)) for rows in pairs]
+    some = pairs[:: -(-len(pairs) // MAX_OWN_PAIRS)]
+    alone = [(rows, _pair_gaps(scene, rows, own_start=True)) for rows in some]
     return _pooled(scene, alone)
 
 
