@@ -32,6 +32,7 @@ COMMANDS = [
     ["refine"],
     ["demo"],
     ["batch"],
+    ["check"],
     ["clean"],
     ["color"],
     ["dense"],
@@ -201,6 +202,8 @@ def test_unsupported_lens_is_named(tmp_path):
         (["--prior", "distance=1"], "--prior distance=1: the key is one of distance_s"),
         (["--prior", "focal_stddev=a"], "'a' is not a number"),
         (["--error", "point_3d"], "hold the distances"),
+        (["--fundamental-max-error", "3"], "give matcher 'paper'"),
+        (["--mapper", "refractive", "--matcher", "paper"], "images does not exist"),
         (
             ["--strategy", "nested", "--refine", "focal", "-o", "x"],
             "refine_focal needs",

@@ -137,3 +137,29 @@ def test_printed_trials_of_the_paper():
         # The paper divides by n = 3, a sample by n - 1.
         assert row["phi_sd_deg"] ** 2 * 2 / 3 == pytest.approx(variance, rel=2e-3)
         assert np.isfinite(row["theta_sd_deg"])
+
+
+def test_three_numbers_against_three_tell_little():
+    """F(2, 2): the chance of a ratio above r is 1 / (1 + r)."""
+    from repeatability import chance_of_ratio
+
+    for larger, smaller in ((0.2, 0.12), (0.298, 0.228)):
+        ratio = (larger / smaller) ** 2
+        assert chance_of_ratio(larger, 3, smaller, 3) == pytest.approx(1 / (1 + ratio))
+        # Whichever is larger.
+        assert chance_of_ratio(smaller, 3, larger, 3) == pytest.approx(1 / (1 + ratio))
+
+
+def test_the_tank_in_partitions_is_told_from_its_tables():
+    import partitions
+    from tables import read_csv
+
+    kept = FOLDER / "results"
+    found = {name: read_csv(kept / f"{name}.csv") for name in partitions.TABLES}
+    text = partitions.section(found)
+    row = next(r for r in found["whole_tank"] if r["method"] == "all parameters")
+    assert f"{row['normal_x_deg']:.2f}" in text
+    # As the page beside the tables has it.
+    page = (kept / "README.md").read_text(encoding="utf-8")
+    table = next(line for line in text.splitlines() if line.startswith("| 3 x 8"))
+    assert table in page

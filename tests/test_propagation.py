@@ -204,6 +204,26 @@ def test_the_frame_that_is_held_does_not_matter(solved, clicked):
     assert abs(found[1] / expected[1] - 1.0) > 0.05
 
 
+def given_back(jac, residuals, clusters, optimum):
+    """What each cluster's part in the pose of its frame took from its residuals, by
+    dense projections: the pose moves without the cluster, and the points follow."""
+    layout = optimum.layout
+    size = jac.shape[1] - 3 * len(layout.point_start) + 3
+    poses, points = jac[:, : layout.num_frame_cols], jac[:, size:]
+    free = poses - points @ np.linalg.lstsq(points, poses, rcond=None)[0]
+    frame = np.repeat(layout.cell_frame, np.diff(layout.cell_start))
+    back = np.zeros(len(residuals))
+    for cluster in range(clusters.max() + 1):
+        rows = np.flatnonzero(clusters == cluster)
+        col = layout.frame_col[frame[rows[0] // 2]]
+        if col < 0:
+            continue
+        own = free[:, col : col + 6]
+        rest = own.T @ own - own[rows].T @ own[rows]
+        back[rows] = own[rows] @ np.linalg.solve(rest, own[rows].T @ residuals[rows])
+    return back
+
+
 def test_errors_that_clusters_share_are_summed_as_they_reach_the_number(solved):
     """Against sums over the dense matrix, cluster after cluster."""
     propagation = Propagation(solved)
@@ -218,8 +238,8 @@ def test_errors_that_clusters_share_are_summed_as_they_reach_the_number(solved):
     columns = size + (3 * known[:, None] + np.arange(3)).ravel()
     gradient[columns] = slope.ravel()
     reach = np.linalg.lstsq(jac.T @ jac, gradient, rcond=1e-14)[0]
-    by_row = (jac @ reach) * residuals
     clusters = np.repeat(clusters_of(optimum), 2)
+    by_row = (jac @ reach) * (residuals + given_back(jac, residuals, clusters, optimum))
     sums = np.bincount(clusters, by_row)
     expected = sums @ sums * len(by_row) / optimum.degrees_of_freedom
     found = propagation.clustered_covariance(places, slope).item()

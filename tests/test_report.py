@@ -45,6 +45,12 @@ def test_refine_writes_a_page_that_says_what_the_summary_says(dive_result):
         assert (
             f"{(known['found_m'] - known['given_m']) / known['stddev_m']:+.1f}" in page
         )
+    for sentence in summary["cross_validation"]["sentences"]:
+        assert sentence in page
+    halves = payload_of(page)["halves"]
+    assert len(halves) == 2 and payload_of(page)["halves_limit"] > 0.0
+    splits = summary["cross_validation"]["splits"]
+    assert halves[0] in [split["projections"]["px"][0][1] for split in splits]
     for camera in summary["cameras"]:
         assert f"tilt {camera['normal_verdict']}" in page
         assert f"distance {camera['distance_verdict']}" in page
@@ -73,6 +79,7 @@ def test_the_numbers_and_pictures_are_beside_it(dive_result):
         "residuals_0.png",
         "residuals_1.png",
         "coverage.png",
+        "halves.png",
         "convergence.png",
         "cloud.png",
     }

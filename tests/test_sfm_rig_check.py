@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from sfm_scenes import same_frame_matches, simulated_dive
 
-from uwsfm.errors import InputError
+from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry import rigid3
 from uwsfm.models.port import DomePort, NoPort
-from uwsfm.rig import Rig
+from uwsfm.rig import Rig, camera_from_colmap
 from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
+from uwsfm.trust.mistakes import shifted
 
 
 @pytest.fixture(scope="module")
@@ -170,10 +171,54 @@ def test_a_wrong_rotation_is_refused(rig, pair, axis, angle_deg):
     refusal(rig, poses, pair)
 
 
-def test_quaternion_in_the_order_wxyz_is_refused(rig, pair):
+def test_quaternion_in_the_order_wxyz_is_named(rig, pair):
     poses = poses_of(rig)
     poses[1, :4] = np.roll(poses[1, :4], 1)
-    refusal(rig, poses, pair)
+    text = refusal(rig, poses, pair)
+    assert "the quaternion of 'right' is in the order w, x, y, z" in text
+
+
+def test_a_lens_of_half_the_resolution_is_named(rig, pair):
+    """One is given for images of 400 x 300."""
+    text = refusal(with_params(rig, (1,), slice(0, 4), 0.5), poses_of(rig), pair)
+    assert "the lens of 'right' was calibrated at another resolution" in text
+    assert "of images 0.5 times as large" in text
+
+
+def test_the_focal_length_of_one_camera_is_named(rig, pair):
+    """Which of the two is wrong no match shows: one too long is the other too short."""
+    text = refusal(with_params(rig, (1,), slice(0, 2), 1.2), poses_of(rig), pair)
+    assert "the focal length of " in text
+    assert "too short, or another camera's too long" in text
+
+
+def with_params(rig: Rig, which: tuple[int, ...], part: slice, factor: float) -> Rig:
+    cameras = list(rig.cameras)
+    for c in which:
+        lens = cameras[c].camera
+        params = np.array(lens.params)
+        params[part] *= factor
+        new = camera_from_colmap(
+            lens.model_name, lens.width, lens.height, params.tolist()
+        )
+        cameras[c] = replace(cameras[c], camera=new)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def test_a_late_camera_is_named(rig, dive):
+    """Its images bear the names of the frames before: neighbours fit, they do not."""
+    scene = shifted(dive.scene, 1, 1, 0)
+
+    def later(shift: int) -> list[PairMatches]:
+        return [same_frame_matches(shifted(scene, 1, -shift, 0))]
+
+    (now,) = later(0)
+    with pytest.raises(ExplainedInputError) as error:
+        poses = poses_of(rig)
+        check_rig(rig, poses, [now], later)
+        check_rotation(rig, poses, turned(rig, poses, now), [now], later)
+    assert error.value.codes == ("frames_shifted",)
+    assert "the images of 'right' are 1 frame late" in str(error.value)
 
 
 def test_baseline_along_another_axis_is_refused(rig, pair):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
+    from uwsfm.check_halves import check_halves
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap import Model
     from uwsfm.color.commands import correct_colors
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from uwsfm.rig import Rig
     from uwsfm.rig_file import load_rig
     from uwsfm.scene import Scene
+    from uwsfm.sfm.options import MatchOptions, StartOptions
     from uwsfm.sfm.refractive_colmap import (
         read_refractive_colmap,
         rig_of_refractive_colmap,
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
         make_map,
         mesh_cloud,
     )
+    from uwsfm.trust.verdict import Verdict, judge
 
 refuse_broken_zlib()
 
@@ -76,6 +79,7 @@ _HOMES = {
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
     "calibrate_housing": "uwsfm.housing_pipeline",
+    "check_halves": "uwsfm.check_halves",
     "clean_cloud": "uwsfm.surface.commands",
     "correct_colors": "uwsfm.color.commands",
     "error_budget": "uwsfm.calibration.error_budget",
@@ -101,10 +105,14 @@ _HOMES = {
     "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
     "Result": "uwsfm.result_folder",
     "open_result": "uwsfm.result_folder",
+    "MatchOptions": "uwsfm.sfm.options",
+    "StartOptions": "uwsfm.sfm.options",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
     "write_report": "uwsfm.report.files",
+    "Verdict": "uwsfm.trust.verdict",
+    "judge": "uwsfm.trust.verdict",
     "write_cloud": "uwsfm.cloud",
 }
 
@@ -117,6 +125,7 @@ __all__ = [
     "FlatPort",
     "InputError",
     "Lengths",
+    "MatchOptions",
     "Model",
     "NoPort",
     "Positions",
@@ -124,10 +133,13 @@ __all__ = [
     "Result",
     "Rig",
     "Scene",
+    "StartOptions",
     "Status",
     "UwsfmError",
+    "Verdict",
     "calibrate",
     "calibrate_housing",
+    "check_halves",
     "clean_cloud",
     "correct_colors",
     "dense_cloud",
@@ -139,6 +151,7 @@ __all__ = [
     "export_ply",
     "export_refractive_colmap",
     "export_scene_ply",
+    "judge",
     "load_rig",
     "make_map",
     "measure",

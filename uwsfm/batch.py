@@ -17,6 +17,7 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.pipeline import checked_rig, output_folder, reconstruct
 from uwsfm.sfm.images import find_frames
 from uwsfm.tasks import LOCAL, Workers, require_threads
+from uwsfm.trust.verdict import Word
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +37,10 @@ class Outcome:
     num_registered_frames: int = 0
     rms_px: float = float("nan")
     """True reprojection error."""
+    verdict: Word | None = None
+    """On the result; None: there is none."""
+    verdict_reason: str | None = None
+    """The first reason why it is not "fits"."""
 
 
 def run_batch(
@@ -129,6 +134,9 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
             except Exception:
                 log.error("%s", traceback.format_exc())
                 raise
+            log.info("verdict: %s", result.verdict.verdict)
+            for item in result.verdict.reasons:
+                log.info("%s: %s", item.severity, item.text)
             for warning in result.summary["warnings"]:
                 log.info("note: %s", warning)
             log.info("done")
@@ -147,6 +155,8 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
             num_frames=summary["num_frames"],
             num_registered_frames=summary["num_registered_frames"],
             rms_px=summary["reprojection_rms_px"]["after"],
+            verdict=result.verdict.verdict,
+            verdict_reason=next((r.text for r in result.verdict.reasons), None),
         )
     return Outcome(name=dive.name, reason=reason, seconds=time.monotonic() - began)
 

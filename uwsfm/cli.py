@@ -13,6 +13,7 @@ import typer
 
 from uwsfm import _signals
 from uwsfm.cli_batch import batch
+from uwsfm.cli_check import check
 from uwsfm.cli_dense import dense
 from uwsfm.cli_export import export, init_from
 from uwsfm.cli_measure import measure
@@ -54,6 +55,7 @@ app = typer.Typer(
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
 app.command()(batch)
+app.command()(check)
 app.command()(dense)
 app.command()(measure)
 app.command()(clean)
@@ -63,7 +65,7 @@ app.command("map")(map_)
 app.command()(report)
 app.command()(view)
 
-FAILED, WRONG_INPUT = 1, 2
+FAILED, WRONG_INPUT, NO_FIT = 1, 2, 3
 
 
 def _print_version(wanted: bool) -> None:
@@ -199,7 +201,7 @@ def reconstruct(
             **priors_of(prior or ()),
         )
     _print_result(result.summary)
-    typer.echo(f"results in {out}")
+    _finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -240,6 +242,16 @@ def calibrate(
     lever_arm: LeverArmOption = None,
     lengths: LengthsOption = None,
     matcher: MatcherOption = "colmap",
+    fundamental_max_error: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PIXELS",
+            help="Tolerance of the fundamental matrix of --matcher paper, in raw "
+            "pixels; default: a hundredth of the image's longer side.",
+            show_default=False,
+        ),
+    ] = None,
+    mapper: MapperOption = "pinhole",
     max_features: MaxFeaturesOption = None,
     scene_distance: SceneDistanceOption = None,
     seed: SeedOption = 0,
@@ -252,9 +264,13 @@ def calibrate(
         from uwsfm.housing_pipeline import calibrate_housing
         from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
+        matching = MatchOptions(
+            matcher=matcher, fundamental_max_error_px=fundamental_max_error
+        )
         front_end = StartOptions(
             features=FeatureOptions(max_num_features=max_features),
-            matching=MatchOptions(matcher=matcher),
+            matching=matching,
+            mapper=mapper,
             seed=seed,
             num_threads=threads,
         )
@@ -275,7 +291,7 @@ def calibrate(
             **priors_of(prior or ()),
         )
     _print_housing(result)
-    typer.echo(f"results in {out}")
+    _finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -327,7 +343,7 @@ def refine(
             **priors_of(prior or ()),
         )
     _print_result(result.summary)
-    typer.echo(f"results in {out}")
+    _finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -344,7 +360,17 @@ def demo(
         result, comparison = run_demo(out, mapper, progress)
     _print_result(result.summary)
     console.print(comparison_table(comparison))
-    typer.echo(f"results in {out}: open report.html, or points.ply in MeshLab")
+    where = f"results in {out}: open report.html, or points.ply in MeshLab"
+    _finish(result.summary, where)
+
+
+def _finish(summary: dict, where: str) -> None:
+    """The last line, and the exit code of the verdict."""
+    from uwsfm.trust.verdict import DOES_NOT_FIT
+
+    typer.echo(where)
+    if summary["verdict"] == DOES_NOT_FIT:
+        raise typer.Exit(NO_FIT)
 
 
 def _print_result(summary: dict) -> None:
@@ -355,10 +381,12 @@ def _print_result(summary: dict) -> None:
         budget_table,
         console,
         housing_table,
+        print_verdict,
         result_table,
         timings_table,
     )
 
+    print_verdict(summary)
     console.print(result_table(summary))
     console.print(housing_table(summary))
     if len(summary["error_budget"]) > 1:  # something was given that may be wrong
@@ -372,8 +400,15 @@ def _print_result(summary: dict) -> None:
 def _print_housing(result: "HousingResult") -> None:
     from rich.markup import escape
 
-    from uwsfm.console import budget_table, calibration_table, console, housing_table
+    from uwsfm.console import (
+        budget_table,
+        calibration_table,
+        console,
+        housing_table,
+        print_verdict,
+    )
 
+    print_verdict(result.summary)
     console.print(calibration_table(result.summary))
     console.print(housing_table(result.summary))
     console.print(budget_table(result.summary))

@@ -25,6 +25,7 @@ def batch(
 
     with ProgressBars() as progress:
         from uwsfm.batch import run_batch
+        from uwsfm.trust.verdict import DOES_NOT_FIT
 
         outcomes = run_batch(
             dives, scheduler=scheduler, num_threads=threads, progress=progress
@@ -34,3 +35,8 @@ def batch(
     if failed:
         typer.echo(f"{len(failed)} of {len(outcomes)} dives failed", err=True)
         raise typer.Exit(1)
+    contradicted = [o for o in outcomes if o.verdict == DOES_NOT_FIT]
+    if contradicted:
+        text = f"{len(contradicted)} of {len(outcomes)} dives do not fit"
+        typer.echo(f"{text}: see summary.json", err=True)
+        raise typer.Exit(3)

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.padding import Padding
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -83,6 +84,22 @@ class ProgressBars:
             if name != step:
                 done = max(self._progress.tasks[task].completed, 1)
                 self._progress.update(task, completed=done, total=done)
+
+
+_STYLES = {"fits": "bold green", "doubtful": "bold yellow", "does not fit": "bold red"}
+
+
+def print_verdict(summary: dict[str, Any]) -> None:
+    """The verdict, and a line for each of its reasons."""
+    from uwsfm.export.verdict_summary import verdict_line
+
+    style = _STYLES.get(summary.get("verdict", ""), "")
+    console.print(Text(verdict_line(summary), style=style))
+    for reason in summary.get("reasons", ()):
+        line = Text(f"{reason['severity']}: {reason['text']}")
+        console.print(Padding(line, (0, 0, 0, 2)))
+    for one in summary.get("explanations", ()):
+        console.print(Padding(Text(f"cause: {one['text']}"), (0, 0, 0, 2)))
 
 
 # Three numbers and their deviations side by side do not fit a narrow terminal.
@@ -332,16 +349,21 @@ def batch_table(outcomes: Iterable[Outcome]) -> Table:
     table = Table(title="Dives", title_justify="left")
     table.add_column("dive", no_wrap=True)
     table.add_column("result")
+    table.add_column("verdict", no_wrap=True)
     for column in ("frames", "RMS (px)", "minutes"):
         table.add_column(column, justify="right", no_wrap=True)
     for outcome in outcomes:
-        frames, rms, result = "", "", Text(f"failed: {outcome.reason}", style="red")
+        frames, rms, verdict = "", "", Text(outcome.verdict or "")
+        result = Text(f"failed: {outcome.reason}", style="red")
         if outcome.reason is None:
             frames = f"{outcome.num_registered_frames} of {outcome.num_frames}"
             rms, result = f"{outcome.rms_px:.3f}", Text("done")
         minutes = outcome.seconds / 60.0
         time = _number(None if math.isnan(minutes) else minutes, "{:.1f}")
-        table.add_row(Text(outcome.name), result, frames, rms, time)
+        if outcome.verdict_reason is not None:
+            result = Text(outcome.verdict_reason)
+        verdict.stylize(_STYLES.get(outcome.verdict or "", ""))
+        table.add_row(Text(outcome.name), result, verdict, frames, rms, time)
     return table
 
 

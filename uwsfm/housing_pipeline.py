@@ -24,6 +24,7 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.pipeline import (
     WORK,
@@ -43,11 +44,14 @@ from uwsfm.sfm.colmap_model import find_model
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.model_start import ModelStart, start_from_model
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.refine import refine_scene, rig_options
+from uwsfm.sfm.refine import refine_scene, rig_options, within_valid_radius
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
+from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.goodness import Used
+from uwsfm.trust.verdict import Verdict, judged, refined_verdict
 
 Start = Literal["virtual", "paper", "pairs"]
 
@@ -64,6 +68,8 @@ class HousingResult:
     """What errors of the given numbers would do to it."""
     summary: dict[str, Any]
     """calibration.json"""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def calibrate_housing(
@@ -91,7 +97,8 @@ def calibrate_housing(
             pinholes of 1.333 f and radial distortion besides (section 3.2.2);
             "pairs": matches between the cameras of one frame only, with rig and
             distances as given (section 3.2.1). One frame alone is "pairs".
-        front_end: how features are found and matched.
+        front_end: how features are found and matched, and which mapper finds the
+            start; see `uwsfm.StartOptions`.
         positions, lever_arm, lengths, scene_distance_m: as in `reconstruct`.
         progress: called with each long step.
         **options: fields of `CalibrateOptions`.
@@ -128,12 +135,18 @@ def calibrate_housing(
         distance_m = scene_distance(rig, scene_distance_m)
         front_end = replace(front_end, scene_distance_m=distance_m)
     job = _Job(rig, source, out, start, front_end, known, progress, merged)
+    _require_front_end_effect(front_end, model=found is not None)
     if found is None:
         frames = find_frames(source, rig, min_num_frames=1)
         known.check_names(rig, frames.names)
         if start == "pairs" or len(frames.names) == 1:
             _require_distances_held(rig, merged, len(frames.names))
             job = replace(job, start="pairs")
+            if front_end.mapper != StartOptions().mapper:
+                raise InputError(
+                    f"mapper {front_end.mapper!r} has no effect: single stereo pairs "
+                    "are not mapped"
+                )
             if known.given:
                 raise InputError(
                     "single stereo pairs tell normals only: lengths and positions have "
@@ -165,28 +178,57 @@ class _Job:
     def run(self, model: ModelStart | None) -> HousingResult:
         compiled(self.front_end.threads, self.progress)
         if self.start == "pairs":
-            calibration = self._from_pairs()
+            calibration, budget = with_budget(self._from_pairs())
+            count = calibration.scene.num_frames
+            seen = len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
+            used = Used(num_frames=count, num_registered=seen)
+            verdict = judged(self.rig, calibration, used)
         else:
             if model is None:
-                scene, names = self._from_images()
+                scene, names, num_frames = self._from_images()
             else:
                 scene, names = model.tracks.scene, model.tracks.frame_names
+                num_frames = len(names)
             if self.start == "paper":
-                scene, _ = perspective_adjustment(scene, loss="cauchy")
+                scene = self._paper_start(scene)
             scene, lengths = self.known.placed(self.rig, names, scene)
             options = {"lengths": lengths, **self.options}
-            calibration = refine_scene(
-                scene, self.rig, self.progress, **options
-            ).calibration
-        return self._finish(calibration, () if model is None else model.warnings)
+            # What is given is given of the rig file's ports, not of the map's.
+            known = replace(scene, cameras=self.rig.refractive_cameras())
+            refined = refine_scene(
+                scene, self.rig, self.progress, known=known, **options
+            )
+            calibration, budget = with_budget(refined.calibration)
+            refined = replace(refined, calibration=calibration)
+            self.progress("judging the fit", 0, None)
+            verdict = refined_verdict(self.rig, refined, num_frames)
+        notes = () if model is None else model.warnings
+        return self._finish(calibration, budget, verdict, notes)
 
-    def _from_images(self) -> tuple[Scene, Sequence[str]]:
-        """The start, and the names of its frames."""
+    def _from_images(self) -> tuple[Scene, Sequence[str], int]:
+        """The start, the names of its frames, and how many frames there were."""
         start = perspective_start(
             self.rig, self.source, self.out / WORK, self.front_end, self.progress
         )
         arrays = start.arrays()
-        return start_scene(self.rig, start, arrays), arrays.frame_names
+        scene = start_scene(self.rig, start, arrays)
+        return scene, arrays.frame_names, start.summary["num_frames"]
+
+    def _paper_start(self, scene: Scene) -> Scene:
+        """Poses from pinholes, by what the calibrations in air reached: section 3.2.2.
+
+        The tracks stay whole, for the caller tests them again.
+        """
+        part, used = scene.select(within_valid_radius(scene, self.rig))
+        adjusted, _ = perspective_adjustment(part, loss="cauchy")
+        points = np.full_like(scene.points, np.nan)
+        points[used] = adjusted.points
+        return replace(
+            scene,
+            cam_from_rig=adjusted.cam_from_rig,
+            rig_from_world=adjusted.rig_from_world,
+            points=points,
+        )
 
     def _from_pairs(self) -> CalibrationResult:
         """Normals from single stereo pairs: section 3.2.1."""
@@ -210,11 +252,14 @@ class _Job:
         ]
 
     def _finish(
-        self, calibration: CalibrationResult, notes: Sequence[str]
+        self,
+        calibration: CalibrationResult,
+        budget: tuple[BudgetRow, ...],
+        verdict: Verdict,
+        notes: Sequence[str],
     ) -> HousingResult:
         scene, _ = calibration.scene.select(calibration.inliers)
         rig = refined_rig(self.rig, scene)
-        calibration, budget = with_budget(calibration)
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,
@@ -230,15 +275,39 @@ class _Job:
             "error_budget": budget_summary(budget),
             "versions": versions(),
         }
-        export_housing(rig, self.out / HOUSING, calibration)
+        summary = with_verdict(verdict, summary)
+        if self.start != "pairs":  # single pairs hold what most mistakes show in
+            causes = explain(
+                verdict.verdict, self.rig, calibration, progress=self.progress
+            )
+            summary["explanations"] = [one.to_json() for one in causes]
+        export_housing(rig, self.out / HOUSING, calibration, verdict=verdict.verdict)
         write_json(summary, self.out / CALIBRATION)
         return HousingResult(
-            rig=rig, calibration=calibration, budget=budget, summary=summary
+            rig=rig,
+            calibration=calibration,
+            budget=budget,
+            summary=summary,
+            verdict=verdict,
         )
 
 
 PAIRS_HOLD = {"refine_distances": False, "refine_cam_from_rig": False}
 """What single stereo pairs cannot tell."""
+
+
+def _require_front_end_effect(front_end: StartOptions, *, model: bool) -> None:
+    """Refuse options of the front end that a COLMAP model leaves without an effect."""
+    options, defaults = front_end, StartOptions()
+    for name, changed in (
+        ("mapper", options.mapper != defaults.mapper),
+        ("matcher", options.matching.matcher != defaults.matching.matcher),
+    ):
+        if model and changed:
+            raise InputError(
+                f"{name} has no effect: a COLMAP model is the start, and no image is "
+                "read; leave this option out, or give the folder of the images"
+            )
 
 
 def _require_distances_held(

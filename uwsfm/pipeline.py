@@ -18,11 +18,13 @@ from uwsfm.errors import InputError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
     export_ply,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.halves_summary import with_halves
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -32,6 +34,7 @@ from uwsfm.export.summary import (
     scale_summary,
     versions,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.first_run import compile_kernels
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import NoPort
@@ -58,6 +61,8 @@ from uwsfm.sfm.refine import Refined, refine_scene, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
+from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.verdict import Verdict, refined_verdict
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,6 +76,8 @@ class ReconstructResult:
     """summary.json"""
     start: StartArrays
     """Where the mapper ended, before the refractive adjustment."""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def reconstruct(
@@ -201,9 +208,14 @@ class _Job:
         refined = replace(refined, calibration=calibration)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
+        self.progress("judging the fit", 0, None)
+        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
+        timings["judging the fit"] = time.perf_counter() - clock
+        clock, word = time.perf_counter(), verdict.verdict
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
-        export_housing(model.rig, out / HOUSING, refined.calibration)
+        export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
+        export_given_rig(self.rig, out / RIG_GIVEN)
         export_points(model, out / POINTS, refined.calibration)
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
@@ -211,6 +223,12 @@ class _Job:
         summary["warnings"] += housing_warnings(model.rig, calibration, budget)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, calibration)
+        summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timings["looking for the cause"] = time.perf_counter() - clock
         found = refined.calibration
         write_with_report(out, model, found, summary, self.progress, wanted=self.report)
         return ReconstructResult(
@@ -218,6 +236,7 @@ class _Job:
             calibration=refined.calibration,
             summary=summary,
             start=arrays,
+            verdict=verdict,
         )
 
     def _refined(self, start: Start, arrays: StartArrays) -> Refined:

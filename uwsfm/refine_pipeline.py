@@ -17,10 +17,12 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
+    RIG_GIVEN,
     SPARSE,
     export_colmap,
 )
-from uwsfm.export.housing import export_housing
+from uwsfm.export.halves_summary import with_halves
+from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -29,6 +31,7 @@ from uwsfm.export.summary import (
     refined_summary,
     versions,
 )
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import (
@@ -63,6 +66,8 @@ from uwsfm.sfm.refine import (
     rig_options,
     without_empty_frames,
 )
+from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.verdict import Verdict, refined_verdict
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 """Camera models without distortion: light through a flat port never fits them."""
@@ -88,6 +93,8 @@ class RefineResult:
     model_idx: NDArray[np.int64]
     """(N,) index in ``start.model`` of each observation of ``model.scene``; -1 of those
     that only the database has."""
+    verdict: Verdict
+    """Whether the result is to be trusted."""
 
 
 def refine_model(
@@ -241,8 +248,14 @@ class _Job:
         model, refined = self._model(refined, tracks)
         calibration, budget = with_budget(refined.calibration)
         refined = replace(refined, calibration=calibration)
+        timing, judging = self.timings, time.perf_counter()
+        self.progress("judging the fit", 0, None)
+        verdict = refined_verdict(self.rig, refined, len(tracks.frame_names))
+        timing["judging the fit"] = time.perf_counter() - judging
+        clock, word = clock + timing["judging the fit"], verdict.verdict
         export_colmap(model, self.out / SPARSE)
-        export_housing(model.rig, self.out / HOUSING, refined.calibration)
+        export_housing(model.rig, self.out / HOUSING, calibration, verdict=word)
+        export_given_rig(self.rig, self.out / RIG_GIVEN)
         export_points(model, self.out / POINTS, refined.calibration)
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
@@ -250,6 +263,12 @@ class _Job:
         summary["warnings"] += housing_warnings(model.rig, calibration, budget)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
+        summary = with_halves(summary, model.rig, calibration)
+        summary = with_verdict(verdict, summary)
+        clock = time.perf_counter()
+        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        summary["explanations"] = [one.to_json() for one in causes]
+        timing["looking for the cause"] = time.perf_counter() - clock
         write_with_report(
             self.out, model, calibration, summary, self.progress, wanted=self.report
         )
@@ -259,6 +278,7 @@ class _Job:
             summary=summary,
             start=self.start,
             model_idx=model_idx,
+            verdict=verdict,
         )
 
     def _refined(

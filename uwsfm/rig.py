@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.errors import InputError
@@ -51,6 +51,14 @@ class RigCamera:
     conversion_rms_px: float | None = None
     accuracy: CameraAccuracy = CameraAccuracy()
     """How well the numbers above are known."""
+
+    def covers(self, xy: Array) -> NDArray[np.bool_]:
+        """Mask (N,) of the pixels (N, 2) that the calibration in air reached."""
+        if self.valid_radius_px is None:
+            return np.ones(len(xy), dtype=bool)
+        center = (self.camera.principal_point_x, self.camera.principal_point_y)
+        radius = np.linalg.norm(np.asarray(xy) - center, axis=1)
+        return radius <= self.valid_radius_px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from uwsfm.colmap import to_reconstruction
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD, Layout
 from uwsfm.solver.threads import limited
 
@@ -39,7 +40,11 @@ def pinhole_colmap(num_frames: int, folder: str) -> dict[str, Any]:
     its minimiser's share of the CPU time counts, not how it sets its problem up. It
     takes turns with ours: the speed of a machine that is shared changes by the second.
     """
-    scene = surveys.load(num_frames, folder)
+    return beside_pinholes(surveys.load(num_frames, folder))
+
+
+def beside_pinholes(scene: Scene) -> dict[str, Any]:
+    """The same of any scene."""
     truth = surveys.as_pinholes(scene)
     start = to_reconstruction(surveys.as_model(surveys.start_of(truth)))
     before = peak_memory_mb()

@@ -79,7 +79,7 @@ def as_pinholes(scene: Scene) -> Scene:
 
 def as_model(scene: Scene) -> Model:
     """A scene whose observations are the keypoints of its images."""
-    rig = paper_rig()
+    rig = _first_cameras(paper_rig(), len(scene.cameras))
     rig = rig.with_geometry(scene.cam_from_rig, scene.ports)
     image = scene.camera_idx * scene.num_frames + scene.frame_idx
     order = np.argsort(image, kind="stable")
@@ -100,6 +100,22 @@ def as_model(scene: Scene) -> Model:
         keypoint_idx=keypoint_idx,
         colors=np.full((scene.num_points, 3), 128, dtype=np.uint8),
     )
+
+
+def of_one_camera(scene: Scene) -> Scene:
+    """What the first camera saw, of points that it saw twice."""
+    mine = scene.camera_idx == 0
+    counts = np.bincount(scene.point_idx[mine], minlength=scene.num_points)
+    alone = replace(
+        scene, cameras=scene.cameras[:1], cam_from_rig=scene.cam_from_rig[:1]
+    )
+    return alone.select(mine & (counts[scene.point_idx] >= 2))[0]
+
+
+def _first_cameras(rig: Rig, count: int) -> Rig:
+    if count == len(rig.cameras):
+        return rig
+    return Rig(cameras=rig.cameras[:count], cam_from_rig=None, baseline_m=None)
 
 
 def _with_lenses(rig: Rig, scene: Scene) -> Rig:

@@ -17,6 +17,7 @@ import fig6
 import fig7
 import fig8
 import loops
+import partitions
 import targets
 from settings import Settings
 from tables import Tables, read_csv, write_csv
@@ -24,7 +25,14 @@ from tables import Tables, read_csv, write_csv
 from uwsfm._files import replaced_file
 from uwsfm.tasks import LOCAL, Workers
 
-FIGURES = {"fig3": fig3, "fig6": fig6, "fig7": fig7, "loops": loops, "fig8": fig8}
+FIGURES = {
+    "fig3": fig3,
+    "fig6": fig6,
+    "fig7": fig7,
+    "loops": loops,
+    "fig8": fig8,
+    "partitions": partitions,
+}
 TIMES = "times.csv"
 
 

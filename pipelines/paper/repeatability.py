@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import f as f_distribution
 from single_pair import HELD
 from tables import Row, column, select
 
@@ -16,7 +17,6 @@ from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import WORK, ReconstructResult
 from uwsfm.rig import Rig
 from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.refine import within_valid_radius
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence, reseeded
@@ -51,7 +51,7 @@ def trials(work: Path, tank: Path | None) -> list[Row]:
     rows = paper_rows()
     with ProgressBars() as progress:
         if tank is not None:
-            rig = _tank_rig(tank, work)
+            rig = tank_rig(tank, work)
             rows += _of_sets("tank", tank, rig, NUM_TANK_SETS, work, progress)
         images = work / "rendered_dive"
         if not images.exists():
@@ -62,7 +62,7 @@ def trials(work: Path, tank: Path | None) -> list[Row]:
     return rows
 
 
-def _tank_rig(tank: Path, work: Path) -> Rig:
+def tank_rig(tank: Path, work: Path) -> Rig:
     """The recommended variant of the tank study: covered lens, rig held."""
     sys.path.append(str(Path(__file__).parent.parent / "uril_tank"))
     from tank_rig import write_rig
@@ -122,9 +122,6 @@ def _stereo_rows(data: str, number: int, rig: Rig, folder: Path) -> list[Row]:
     """Normals alone from matches within the pairs, as in the paper's figure 8."""
     frames = find_frames(folder / "images", rig)
     scene = same_frame_scene(rig, frames, folder / "out" / WORK / "database.db")
-    scene, _ = scene.select(within_valid_radius(scene, rig))
-    # Not yet by their gaps: the ports are guesses. But alone, no ray says anything.
-    scene = without_wrong_matches(scene, max_gaps=np.inf)
     first = uwsfm.calibrate(scene, **HELD)
     # Now that the normals are known, a wrong match shows.
     result = uwsfm.calibrate(without_wrong_matches(first.scene), **HELD)
@@ -215,3 +212,12 @@ def _rms_or_none(rows: Sequence[Row], name: str) -> float | None:
     if values[0] is None:
         return None
     return float(np.sqrt(np.nanmean(np.square(np.array(values, dtype=float)))))
+
+
+def chance_of_ratio(first: float, count: int, second: float, other: int) -> float:
+    """Chance of a ratio of two variances as large, the larger one above, if both are
+    equal: of standard deviations of so many numbers."""
+    ratio, freedom = (first / second) ** 2, (count - 1, other - 1)
+    if ratio < 1.0:
+        ratio, freedom = 1.0 / ratio, freedom[::-1]
+    return float(f_distribution.sf(ratio, *freedom))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from repeatability import chance_of_ratio
 from single_pair import ERRORS
 from tables import Row, Tables, markdown, select
 
@@ -79,6 +80,10 @@ def _repeatability(rows: list[Row]) -> Iterator[Row]:
             yield _line(
                 f"{row['data']}, {row['method']}, {row['camera']}: "
                 f"sd of θ below the paper's {limit:.2f} deg",
-                f"{row['theta_sd_deg']:.3f} deg",
+                f"{row['theta_sd_deg']:.3f} deg (p = {_chance(row, limit):.2f})",
                 row["theta_sd_deg"] <= limit,
             )
+
+
+def _chance(row: Row, limit: float) -> float:
+    return chance_of_ratio(row["theta_sd_deg"], int(row["sets"]), limit, 3)

@@ -66,7 +66,8 @@ def _radial(camera: "GivenCamera") -> tuple[dict[int, int], ...]:
 class CameraAccuracy:
     """Standard deviations of one camera's given numbers; None: the default is assumed.
 
-    What is refined without a prior is not given, and its entry has no effect.
+    What is refined without a prior is not given: its entry has no effect on estimates
+    and deviations, only on the verdict, for which it is a claim.
     """
 
     focal: float | None = None

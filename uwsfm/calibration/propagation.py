@@ -29,7 +29,7 @@ from uwsfm.calibration.uncertainty import (
 )
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver.clustered import cluster_scores
+from uwsfm.solver.clustered import cluster_scores, given_back
 from uwsfm.solver.covariance import reduced_covariance
 from uwsfm.solver.layout import HELD, Layout, build_layout, with_columns
 from uwsfm.solver.levenberg_marquardt import suitable_blas
@@ -177,7 +177,9 @@ class Propagation:
         scores = cluster_scores(
             layout, state, self._eqs, self._reduced, cluster, solved.T
         )
-        self._add_own_scores(places, slopes, cluster, scores)
+        if np.any(places.in_model != FEATURE):
+            back = given_back(layout, state, self._eqs, self._reduced, cluster)
+            self._add_own_scores(places, slopes, cluster, back, scores)
         found = scores.T @ scores * 2 * len(layout.xy) / optimum.degrees_of_freedom
         if optimum.priors is not None:
             split = layout.num_frame_cols
@@ -218,7 +220,12 @@ class Propagation:
         return np.einsum("kmi,mij,lmj->kl", some, places.own[which], some)
 
     def _add_own_scores(
-        self, places: Places, slopes: Array, cluster: IndexArray, scores: Array
+        self,
+        places: Places,
+        slopes: Array,
+        cluster: IndexArray,
+        back: Array,
+        scores: Array,
     ) -> None:
         """What residuals of the model's points do to these points themselves."""
         optimum = self.optimum
@@ -228,7 +235,8 @@ class Propagation:
             cells = layout.point_start[p], layout.point_start[p + 1]
             rows = np.arange(*layout.cell_start[list(cells)])
             seen = self._observations(rows, p)
-            pull = np.einsum("nij,ni->nj", pixels_by_point(seen), seen.residuals())
+            errors = seen.residuals() + back[rows]
+            pull = np.einsum("nij,ni->nj", pixels_by_point(seen), errors)
             reach = slopes[:, m] @ places.own[m] / optimum.sigma_px**2  # (K, 3)
             np.add.at(scores, cluster[rows], np.nan_to_num(pull) @ reach.T)
 

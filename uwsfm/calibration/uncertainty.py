@@ -82,6 +82,25 @@ def posterior_covariance(optimum: Optimum) -> Posterior:
         return _posterior_covariance(optimum, reduction)
 
 
+def border_covariance(optimum: Optimum) -> Array:
+    """Covariance (B, B) of rig, ports and lenses, neighbours' shared errors included.
+
+    That of independent errors, with each variance raised to the cluster-robust one
+    where that is larger: a full matrix of few clusters has directions of no variance.
+    """
+    reduction = analyse(optimum.layout)
+    with suitable_blas(reduction):
+        eqs = likelihood(optimum.layout, optimum.state, optimum.priors)
+        reduced = reduced_covariance(optimum.layout, eqs, reduction)
+        alone = optimum.sigma_px**2 * reduced.border
+        if not reduced.determined:
+            return alone
+        shared = _shared_errors(optimum, eqs, reduced)
+    own = np.diag(alone)
+    raised = np.sqrt(np.maximum(np.diag(shared), own) / np.maximum(own, 1e-300))
+    return raised[:, None] * alone * raised
+
+
 def held_length_stddev(optimum: Optimum) -> float:
     """Relative standard deviation of the distance between the two frames that holds an
     open scale, if it were free; infinite if it is open."""

@@ -28,6 +28,8 @@ SPARSE, HOUSING, POINTS, SUMMARY = (
     "points.ply",
     "summary.json",
 )
+RIG_GIVEN = "rig_given.yaml"
+"""The rig file that a result was made with, every number as it was given."""
 WORK = "uwsfm-work"
 """Folder inside the output folder where the steps keep their results."""
 

@@ -8,10 +8,13 @@ from typing import Any
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.observability import center_verdict, distance_verdict
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.export.verdict_summary import shown_word
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_file import dump_rig
+from uwsfm.trust.verdict import FITS
 
+GIVEN = """The rig as given for this result, before anything was refined."""
 HEADER = """The rig as refined by uwsfm from underwater images; loadable as a rig file.
 Standard deviations are one sigma; normals are unit vectors from camera to water.
 "estimated" lets it hold what no person would type; "accuracy" is in all."""
@@ -20,16 +23,29 @@ refined is in the arbitrary unit of the model, not in metres."""
 
 
 def export_housing(
-    rig: Rig, path: str | Path, calibration: CalibrationResult | None = None
+    rig: Rig,
+    path: str | Path,
+    calibration: CalibrationResult | None = None,
+    *,
+    verdict: str = FITS,
 ) -> None:
-    """Write a rig, with standard deviations as comments if known."""
+    """Write a rig, with standard deviations as comments if known.
+
+    Args:
+        rig: As refined.
+        path: The file.
+        calibration: The result that it is of.
+        verdict: On that result; the comments say no more than it does.
+    """
     comments, header, arbitrary = {}, HEADER, False
     if calibration is not None:
         arbitrary = calibration.covariance.scale_stddev is None
         if arbitrary:
             header = f"{HEADER}\n{ARBITRARY}"
+        if verdict != FITS:
+            header += f"\nVerdict: {verdict}. The reasons are in the summary beside it."
         comments = {
-            camera.name: _comments(rig, calibration, index)
+            camera.name: _comments(rig, calibration, index, verdict)
             for index, camera in enumerate(rig.cameras)
         }
         rig = _with_accuracy(rig, calibration)
@@ -67,7 +83,14 @@ def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]:
+def export_given_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig as it was given, for `uwsfm check` to find the mistake in it."""
+    dump_rig(rig, path, GIVEN, {})
+
+
+def _comments(
+    rig: Rig, calibration: CalibrationResult, index: int, verdict: str
+) -> list[str]:
     camera = rig.cameras[index]
     cov = calibration.covariance.cameras[index]
     in_all = calibration.covariance.judged_cameras[index]
@@ -81,13 +104,13 @@ def _comments(rig: Rig, calibration: CalibrationResult, index: int) -> list[str]
             ", ".join(f"{1e3 * value:.3f}" for value in c.center_stddev_m)
             for c in (cov, in_all)
         )
-        verdict = center_verdict(port.radius, in_all, True)
+        word = shown_word(center_verdict(port.radius, in_all, True), verdict)
         lines.append(
             f"center: standard deviation {own} {unit} from the images, {total} in all: "
-            f"{verdict}"
+            f"{word}"
         )
     if isinstance(port, FlatPort):
-        lines += _flat_comments(camera, port, (cov, in_all), unit)
+        lines += _flat_comments(camera, port, (cov, in_all), unit, verdict)
     if index > 0 and calibration.options.refine_cam_from_rig:
         lines.append(
             f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg from the "
@@ -101,6 +124,7 @@ def _flat_comments(
     port: FlatPort,
     both: tuple[CameraCovariance, CameraCovariance],
     unit: str,
+    verdict: str,
 ) -> list[str]:
     cov, in_all = both
     lines = []
@@ -109,12 +133,13 @@ def _flat_comments(
             f"normal: standard deviation {cov.normal_stddev_deg:.4f} deg from the "
             f"images, {in_all.normal_stddev_deg:.4f} in all"
         )
-    verdict = distance_verdict(port.distance, in_all, camera.refine_distance)
+    word = distance_verdict(port.distance, in_all, camera.refine_distance)
+    word = shown_word(word, verdict)
     if cov.distance_at_zero:
-        lines.append(f"distance: {verdict}; the images contradict the lens in air")
+        lines.append(f"distance: {word}; the images contradict the lens in air")
     elif camera.refine_distance:
         lines.append(
             f"distance: standard deviation {1e3 * cov.distance_stddev_m:.3f} {unit} "
-            f"from the images, {1e3 * in_all.distance_stddev_m:.3f} in all: {verdict}"
+            f"from the images, {1e3 * in_all.distance_stddev_m:.3f} in all: {word}"
         )
     return lines

@@ -21,7 +21,9 @@ from uwsfm.calibration.observability import (
     normal_verdict,
 )
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.calibration.reopened import reopened
 from uwsfm.calibration.tilt import paper_tilt
+from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.models.lens import param_slots
 from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.residuals import border
@@ -217,10 +219,14 @@ def _positions_summary(
 def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, Any]]:
     """Estimates beside ports and placement: water, baselines, lenses."""
     covariance, scene = calibration.covariance, calibration.scene
-    stddevs = np.sqrt(np.append(np.diag(covariance.border), np.nan))
-    in_all = stddevs
+    if not _refines_more(calibration):
+        return []
+    # As of ports: what neighbouring features share is in it.
+    variances = np.diag(border_covariance(reopened(calibration)))
+    stddevs = in_all = np.sqrt(np.append(variances, np.nan))
     if covariance.in_all is not None:
-        in_all = np.sqrt(np.append(np.diag(covariance.in_all.border), np.nan))
+        added = np.diag(covariance.in_all.border) - np.diag(covariance.border)
+        in_all = np.sqrt(np.append(variances + added, np.nan))
     entries = []
 
     def add(name: str, camera: int, slot: int, value: float) -> None:
@@ -251,6 +257,12 @@ def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, 
             text = f"{name} of {item.name}"
             add(text, c, border.FIRST_LENS + slot, float(value))
     return entries
+
+
+def _refines_more(calibration: CalibrationResult) -> bool:
+    """Whether anything but ports, and directions of the placement, was refined."""
+    slots = [border.WATER_INDEX, border.LENGTH, *range(*border.LENS.indices(10**3))]
+    return bool(np.any(calibration.covariance.border_cols[:, slots] != HELD))
 
 
 def budget_summary(rows: Sequence[BudgetRow]) -> list[dict[str, Any]]:

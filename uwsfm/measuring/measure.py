@@ -15,12 +15,14 @@ from uwsfm.calibration.length_verdicts import ASK_FOR_LENGTH, scale_verdict
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.errors import InputError
 from uwsfm.export.summary import versions, write_json
+from uwsfm.export.verdict_summary import shown_word, verdict_note
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.measuring import quantities
 from uwsfm.measuring.measurements_file import Task, load_measurements
 from uwsfm.measuring.quantities import Quantity
 from uwsfm.measuring.spots import Spot, Spotter
 from uwsfm.result_folder import Result, open_result
+from uwsfm.trust.verdict import FITS
 
 DOUBTFUL, CONTRADICTION = 2.0, 4.0
 """Standard deviations that a scale bar may be off by."""
@@ -123,12 +125,13 @@ def measure(
         for i, (task, quantity, r) in enumerate(zip(tasks, found, rows, strict=True))
     )
     bars = known.scale_bars(items)
+    warnings = (*verdict_note(result.summary), *known.warnings)
     answer = MeasureResult(
         unit=result.unit,
         measurements=items,
         scale_bars=bars,
-        warnings=known.warnings,
-        summary=_summary(result, items, bars, known.warnings),
+        warnings=warnings,
+        summary=_summary(result, items, bars, warnings),
     )
     if report is not None:
         write_json(answer.summary, report)
@@ -298,12 +301,15 @@ def _summary(
     warnings: Sequence[str],
 ) -> dict[str, Any]:
     arbitrary = result.calibration.covariance.scale_stddev is None
+    entries = [entry(item, arbitrary) for item in items]
+    for row in entries:
+        row["verdict"] = shown_word(row["verdict"], result.summary.get("verdict", FITS))
     return {
         "result": str(result.folder.absolute()),
         "model": result.fingerprint,
         "unit": result.unit,
         "stddev": STDDEV,
-        "measurements": [entry(item, arbitrary) for item in items],
+        "measurements": entries,
         "scale_bars": bars,
         "warnings": list(warnings),
         "versions": versions(),

@@ -1,7 +1,5 @@
 """All numbers of a report, as plain data."""
 
-import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +8,12 @@ import numpy as np
 
 from uwsfm.calibration.problem import Covariance
 from uwsfm.colmap import Model
+from uwsfm.export.verdict_summary import plain
 from uwsfm.report.left_files import left_files
-from uwsfm.report.residuals import FEWEST, CameraResiduals, camera_residuals
 from uwsfm.report.tables import Estimate, Frame, estimates, frames
 from uwsfm.report.view import View, view_of
-from uwsfm.report.words import Verdict, small_lengths, unit_of, verdict_of
+from uwsfm.report.words import Conclusions, small_lengths, unit_of, verdict_of
+from uwsfm.trust.residuals import FEWEST, CameraResiduals, camera_residuals
 
 PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"
 
@@ -44,7 +43,7 @@ class Report:
     """Of small lengths: "mm", or "units" as well."""
     small_scale: float
     """How many of it a unit is."""
-    verdict: Verdict
+    verdict: Conclusions
     estimates: tuple[Estimate, ...]
     view: View
     residuals: tuple[CameraResiduals, ...]
@@ -115,17 +114,3 @@ def numbers_of(report: Report) -> dict[str, Any]:
         "versions": report.summary["versions"],
         "command": report.summary.get("command"),
     }
-
-
-def plain(value: Any) -> Any:
-    """Data as JSON has them: NaN becomes null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = dataclasses.fields(value)
-        return {field.name: plain(getattr(value, field.name)) for field in fields}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

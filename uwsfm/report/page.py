@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm.report.gather import Report, plain
-from uwsfm.report.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.export.verdict_summary import plain
+from uwsfm.report.gather import Report
+from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.report.tables import budget_columns, budget_lines
 from uwsfm.report.words import deviation, known_length_rows, position_words
+from uwsfm.trust.residuals import FEWEST, CameraResiduals, Profile, Residuals
+from uwsfm.trust.verdict import LENS_SHARE
 
 _BADGES = {
     "determined": "good",
@@ -23,9 +26,11 @@ _BADGES = {
     "not determined": "bad",
     "arbitrary": "bad",
     "ran into zero": "bad",
+    "fits": "good",
+    "doubtful": "weak",
+    "does not fit": "bad",
+    "withheld": "bad",
 }
-LENS_SHARE = 0.7
-"""Of systematic residuals: if less is left with a free lens, it was the lens."""
 _SIGNS = {"good": "●", "weak": "◐", "bad": "○"}
 """A shape beside the word: colour alone tells nothing to many."""
 
@@ -64,6 +69,7 @@ def page_of(report: Report) -> str:
         written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         water_given=not any("water index" in row["name"] for row in summary["refined"]),
         systematic=_systematic_words(report),
+        halves=halves_of(summary),
         known_lengths=known_length_rows(summary),
         budget=budget_lines(summary),
         budget_columns=budget_columns(summary),
@@ -255,6 +261,7 @@ def _payload(report: Report, scales: Scales) -> dict[str, Any]:
         "residuals": plain(report.residuals),
         "scales": plain(scales),
         "view": _view_payload(report),
+        **halves_payload(report.summary),
     }
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwsfm.report.gather import Report
+from uwsfm.report.halves import halves_payload
 from uwsfm.report.page import Scales, cost_unit, scales_of
-from uwsfm.report.residuals import CameraResiduals, Profile, Residuals
+from uwsfm.trust.residuals import CameraResiduals, Profile, Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +26,8 @@ _MOST_POINTS = 20_000
 
 
 def draw_pictures(report: Report, folder: Path) -> None:
-    """Write residuals_CAMERA.png, coverage.png, convergence.png and cloud.png."""
+    """Write residuals_CAMERA.png, coverage.png, convergence.png, cloud.png, and
+    halves.png if there is a cross-validation."""
     with _without_collection():
         _draw_all(report, folder)
 
@@ -49,6 +51,9 @@ def _draw_all(report: Report, folder: Path) -> None:
         figure = _residual_figure(camera, report.unit, scales)
         _save(figure, folder / f"residuals_{index}.png")
     _save(_coverage_figure(report), folder / "coverage.png")
+    drawn = halves_payload(report.summary)
+    if drawn:
+        _save(_halves_figure(report, drawn), folder / "halves.png")
     _save(_convergence_figure(report.summary), folder / "convergence.png")
     _save(_cloud_figure(report), folder / "cloud.png")
 
@@ -163,6 +168,28 @@ def _coverage_figure(report: Report) -> "Figure":
         )
         figure.colorbar(shown, ax=axes, shrink=0.8, label="observations")
         axes.set_title(camera.name)
+    return figure
+
+
+def _halves_figure(report: Report, drawn: dict[str, Any]) -> "Figure":
+    """By how much two halves of the frames project differently, per camera."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    cameras = report.residuals
+    figure, grid = _panels(5.2, 4.2, columns=len(cameras))
+    colors = LinearSegmentedColormap.from_list("map", _MAP)
+    for axes, camera, values in zip(grid[0], cameras, drawn["halves"], strict=True):
+        image = axes.imshow(
+            np.array(values, dtype=np.float64),
+            extent=(0, camera.size[0], camera.size[1], 0),
+            vmin=0.0,
+            vmax=drawn["halves_limit"],
+            cmap=colors,
+        )
+        figure.colorbar(image, ax=axes, label="difference (px)", shrink=0.8)
+        axes.set_title(f"{camera.name}: projections of two halves")
+        axes.set_xlabel("x (px)")
+        axes.set_ylabel("y (px)")
     return figure
 
 

@@ -4,17 +4,26 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from uwsfm.export.verdict_summary import DOUBTFUL_WORD, WITHHELD, verdict_line
+
 ARBITRARY_UNIT = "scale arbitrary"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class Conclusions:
     """What a reader needs first."""
 
+    line: str
+    """The verdict on the result, as a sentence."""
+    word: str | None
+    """"fits", "doubtful", "does not fit"; None: an earlier version made the result."""
+    reasons: tuple[tuple[str, str], ...]
+    """Severity and sentence of each."""
     metric: str
     """Whether lengths are metres, some sentences."""
     metric_word: str
-    """"determined", "weakly determined", "not determined" or "arbitrary"."""
+    """"determined", "weakly determined", "not determined", "arbitrary"; where the
+    result does not simply fit, "doubtful" or "withheld"."""
     fit: str
     ports: tuple["PortVerdict", ...]
     open: tuple[str, ...]
@@ -31,12 +40,15 @@ class PortVerdict:
     """What, and the word for how well the images determine it."""
 
 
-def verdict_of(summary: dict[str, Any]) -> Verdict:
+def verdict_of(summary: dict[str, Any]) -> Conclusions:
     """The verdict of a summary.json."""
     rms = summary["reprojection_rms_px"]
     registered, frames = summary["num_registered_frames"], summary["num_frames"]
     points, count = summary["num_points"], summary["num_observations"]
-    return Verdict(
+    return Conclusions(
+        line=verdict_line(summary),
+        word=summary.get("verdict"),
+        reasons=tuple((r["severity"], r["text"]) for r in summary.get("reasons", ())),
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
         fit=f"{registered} of {frames} frames are registered, with {points} points "
@@ -151,11 +163,18 @@ def _metric(summary: dict[str, Any]) -> str:
         )
     if word == "not determined":
         return "The model is not metric: what was given does not determine its scale."
+    if word == WITHHELD:
+        return (
+            "Whether the model is metric is withheld, because the model does not fit "
+            "the images: no length and no ± below can be relied on."
+        )
     known = (
         f"every length shares an error of {1e2 * in_all:.2g} % in all, "
         f"{1e2 * stddev:.2g} % from the images"
     )
     kind = "metric" if word == "determined" else "metric, but weakly"
+    if word == DOUBTFUL_WORD:
+        kind, known = "doubtful", f"if it fits, {known}"
     return f"The model is {kind}: {known}. {_source(summary)}"
 
 

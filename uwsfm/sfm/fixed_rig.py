@@ -16,7 +16,7 @@ from uwsfm.sfm.images import Frames
 from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
 from uwsfm.sfm.rig_check import check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
-from uwsfm.sfm.same_frame import read_same_frame_matches
+from uwsfm.sfm.same_frame import PairMatches, read_same_frame_matches
 
 NEAR_TO_FAR = (0.7, 1.0, 1.4)
 """Depths of the scene of a single camera, by its distance: nothing measures them."""
@@ -55,11 +55,15 @@ def fix_rig(
     """
     cameras = rig.refractive_cameras()
     pairs = read_same_frame_matches(features_path, frames, rig)
+
+    def shifted(shift: int) -> list[PairMatches]:
+        return read_same_frame_matches(features_path, frames, rig, shift)
+
     if len(cameras) > 1:
-        check_rig(rig, poses, pairs)
+        check_rig(rig, poses, pairs, shifted)
     rotation = correct_rotations(cameras, poses, pairs)
     if len(cameras) > 1:
-        check_rotation(rig, poses, rotation, pairs)
+        check_rotation(rig, poses, rotation, pairs, shifted)
         depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
     else:
         depths = scene_distance_m * np.array([NEAR_TO_FAR])

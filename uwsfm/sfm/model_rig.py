@@ -271,7 +271,7 @@ def _checked_start(
             "cam_from_rig was derived from the poses of the model: the rig file gives "
             "a baseline length only"
         ]
-    matches = same_frame_matches(model, len(rig.cameras))
+    matches = same_frame_matches(model, rig)
     enough = any(len(pair) >= MIN_RIG_MATCHES for pair in matches)
     notes, poses = [], np.asarray(rig.cam_from_rig)
     if enough:
@@ -290,12 +290,16 @@ def _checked_start(
     return poses, notes
 
 
-def same_frame_matches(model: ImageModel, num_cameras: int) -> list[PairMatches]:
-    """Pixels of the points that two cameras see in the same frame, by pair."""
+def same_frame_matches(model: ImageModel, rig: Rig) -> list[PairMatches]:
+    """Pixels of the points that two cameras see in the same frame, by pair, as far as
+    the calibrations in air reached."""
     keys = model.frame_idx * len(model.points) + model.point_idx
-    rows = [np.flatnonzero(model.camera_idx == c) for c in range(num_cameras)]
+    rows = []
+    for index, camera in enumerate(rig.cameras):
+        own = np.flatnonzero(model.camera_idx == index)
+        rows.append(own[camera.covers(model.xy[own])])
     found = []
-    for a, b in combinations(range(num_cameras), 2):
+    for a, b in combinations(range(len(rows)), 2):
         _, in_a, in_b = np.intersect1d(
             keys[rows[a]], keys[rows[b]], return_indices=True
         )

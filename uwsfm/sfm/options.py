@@ -110,6 +110,12 @@ class MatchOptions:
             raise InputError(
                 f"fundamental_max_error_px must be positive and finite, got {error_px}"
             )
+        if error_px is not None and self.matcher != "paper":
+            raise InputError(
+                "fundamental_max_error_px has no effect: it is a tolerance of the "
+                f"paper's matcher, and the matcher is {self.matcher!r}; give "
+                "matcher 'paper' (--matcher paper)"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.second_start import better_start
 
 # A point nearer to a camera than this many degrees of parallax has no depth.
 MIN_ANGLE_DEG = 1.5
@@ -38,6 +39,8 @@ class Refined:
     """Of ``scene``: its masks and covariances use ``scene``'s indices."""
     start_rms_px: float
     """True error of the kept observations before the first solve, px."""
+    num_tested: int
+    """Observations given, within what the calibrations in air covered."""
 
 
 def rig_options(rig: Rig) -> dict[str, Any]:
@@ -92,16 +95,23 @@ def refine_scene(
     scene = _at_scale(retriangulated(scene, calibrated), given, calibrated)
     start, known = scene, known or scene
 
-    def solve(scene: Scene, keep: NDArray[np.bool_]) -> CalibrationResult:
+    def once(scene: Scene, keep: NDArray[np.bool_], **more: Any) -> CalibrationResult:
         keep[given.clicked] = True
         part, used = scene.select(_require(keep, scene))
         inside = None
         if lengths is not None:
             inside = with_click_noise(given, scene).in_part(keep, used)
-        return calibrate(part, known=known, lengths=inside, report=report, **options)
+        how = {**options, **more}
+        return calibrate(part, known=known, lengths=inside, report=report, **how)
+
+    def solve(
+        scene: Scene, keep: NDArray[np.bool_]
+    ) -> tuple[CalibrationResult, NDArray[np.bool_]]:
+        found = once(scene, keep)
+        return better_start(found, scene, keep, known.ports, once)
 
     keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
-    first = solve(scene, keep)
+    first, keep = solve(scene, keep)
     trusted = np.zeros_like(keep)
     trusted[np.nonzero(keep)[0][first.inliers]] = True
     # Points that the start was too far off for get another chance, as a whole.
@@ -110,7 +120,7 @@ def refine_scene(
     scene = retriangulated(_with_result(scene, first), trusted)
     keep = good_observations(scene, MAX_ERROR_PX) & calibrated
     check_clicks(given, scene)
-    second = solve(scene, keep)
+    second, keep = solve(scene, keep)
     clicks = np.isin(np.nonzero(keep)[0], given.clicked)
     found = second.inliers & ~clicks
     kept = np.nonzero(keep)[0][found]
@@ -123,6 +133,7 @@ def refine_scene(
         kept=kept,
         calibration=_compact(second, final, still, clicks),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
+        num_tested=int(np.count_nonzero(calibrated)),
     )
 
 
@@ -184,11 +195,11 @@ def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
 
 def within_valid_radius(scene: Scene, rig: Rig) -> NDArray[np.bool_]:
     """Mask (N,) of the observations that the calibrations in air covered."""
-    radii = [c.valid_radius_px for c in rig.cameras]
-    limits = np.array([np.inf if radius is None else radius for radius in radii])
-    centers = np.array([camera.lens[2:4] for camera in scene.cameras])
-    offset = scene.xy - centers[scene.camera_idx]
-    return np.linalg.norm(offset, axis=1) <= limits[scene.camera_idx]
+    covered = np.ones(scene.num_observations, dtype=bool)
+    for index, camera in enumerate(rig.cameras):
+        rows = scene.camera_idx == index
+        covered[rows] = camera.covers(scene.xy[rows])
+    return covered
 
 
 def retriangulated(scene: Scene, trusted: NDArray[np.bool_]) -> Scene:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -59,7 +58,7 @@ def map_refractively(
         UwsfmError: nothing could be reconstructed.
     """
     space = Workspace(work_dir=steps.work_dir)
-    inputs = [key, "refractive", asdict(options.mapping), _refined_content(rig)]
+    inputs = [key, "refractive", asdict(options.mapping), rig_options(rig)]
     part_frames = part_size(len(frames.names), options.mapping.submap_frames)
 
     @cache
@@ -109,11 +108,3 @@ def map_refractively(
         )
     steps.run("mapping", inputs, map_all, outputs=[space.refractive])
     return load_refractive_start(space.refractive, space.features, frames)
-
-
-def _refined_content(rig: Rig) -> list[Any]:
-    """What the refractive mapper may refine, and which pixels it may use, JSON."""
-    return [
-        rig_options(rig),
-        [camera.valid_radius_px for camera in rig.cameras],
-    ]

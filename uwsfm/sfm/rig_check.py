@@ -6,17 +6,26 @@ with a plausible error: only the points that both cameras see in one frame tell.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm.errors import InputError
+from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort, NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
+from uwsfm.sfm.correction import Correction
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
+from uwsfm.sfm.lens_mistakes import focal_corrections
+from uwsfm.sfm.rig_mistakes import (
+    SHIFTS,
+    corrected_pixels,
+    corrections,
+    shift_words,
+)
 from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, RigRotation, correct_rotations
 from uwsfm.sfm.same_frame import PairMatches
 
@@ -30,26 +39,44 @@ MAX_REST = 5e-3
 """Radians that no turn explains, median: a wrong direction of the baseline."""
 SAME_TURN_DEG = 0.75
 """Tilted ports turn rays by so much: explanations closer than that are both named."""
+SAME_MISFIT = 1.5
+"""So is an explanation whose rays miss by so many times the best one's."""
+LEAST_MISFIT = 2e-4
+"""Radians: a fifth of a pixel, noise."""
+CLEARLY_BETTER = 3.0
+"""So many of these an explanation must gain against the rig as given."""
+MAX_PHRASES = 3
+IDEA_MATCHES = 800
+"""Of a pair of cameras are enough to compare explanations."""
 POSE_HINT = (
     "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
     "the axes of translation_m, and that images of equal names were taken together"
 )
 
 
-def check_rig(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> None:
+Shifted = Callable[[int], Sequence[PairMatches]]
+"""Matches between each frame of a camera and the frame of another so much later."""
+
+
+def check_rig(
+    rig: Rig,
+    cam_from_rig: Array,
+    pairs: Sequence[PairMatches],
+    shifted: Shifted | None = None,
+) -> None:
     """Refuse a rig that contradicts its images, and say what to change.
 
     Args:
         rig: Cameras and initial ports.
         cam_from_rig: Poses (C, 7) to check.
         pairs: Matches of the same frame.
+        shifted: Gives those of neighbouring frames; None: there are none.
 
     Raises:
-        InputError: too few matches to tell, swapped image folders, an inverted
-            ``cam_from_rig``, a translation that is a camera position, or a pose that
-            fits in no way.
+        InputError: too few matches to tell, or a pose that does not fit; names the
+            mistake in the rig file or in the images that explains it.
     """
-    _check_counts(rig, pairs)
+    _check_counts(rig, cam_from_rig, pairs, shifted)
     cameras = rig.refractive_cameras()
     for pair in pairs:
         if len(pair) < MIN_RIG_MATCHES:
@@ -62,12 +89,17 @@ def check_rig(rig: Rig, cam_from_rig: Array, pairs: Sequence[PairMatches]) -> No
         if in_front >= MIN_IN_FRONT and misfit <= MAX_MISFIT:
             continue
         names = rig.cameras[a].name, rig.cameras[b].name
-        remedies = _remedies(rig, pair, b_from_a)
-        if remedies:
-            raise InputError(
+        found = remedies(rig, cam_from_rig, pair, shifted)
+        if found:
+            evidence = (
+                f"only {in_front:.0%} of the points that both see lie in front of them"
+                if in_front < MIN_IN_FRONT
+                else f"rays of the same point miss by {np.degrees(misfit):.1f} degrees"
+            )
+            raise ExplainedInputError(
                 f"cameras {names[0]!r} and {names[1]!r} contradict their images: as "
-                f"described, only {in_front:.0%} of the points that both see lie in "
-                f"front of them; probably {' or '.join(remedies)}"
+                f"described, {evidence}; probably {_words(found)}",
+                tuple(found),
             )
         if in_front < MIN_IN_FRONT:
             raise InputError(
@@ -83,6 +115,7 @@ def check_rotation(
     cam_from_rig: Array,
     rotation: RigRotation,
     pairs: Sequence[PairMatches],
+    shifted: Shifted | None = None,
 ) -> None:
     """Refuse a rig that needs more than tilted ports could explain.
 
@@ -94,26 +127,36 @@ def check_rotation(
         cam_from_rig: Poses (C, 7) before any turn.
         rotation: The turns that fit them best.
         pairs: Matches of the same frame.
+        shifted: As of `check_rig`.
 
     Raises:
-        InputError: names the camera, or ports that are missing.
+        InputError: names the mistake that explains the matches, or the camera.
     """
     if any(item.refine_center for item in rig.cameras):
         return
     worst = int(rotation.turn_deg.argmax())
-    if rotation.turn_deg[worst] > MAX_TURN_DEG:
+    turn = float(rotation.turn_deg[worst])
+    if turn <= MAX_TURN_DEG and rotation.misfit_after <= MAX_REST:
+        return
+    pair = max(pairs, key=len)
+    if turn > MAX_TURN_DEG:
         seen = [p for p in pairs if worst in (p.camera_a, p.camera_b)]
-        _check_ports(rig, cam_from_rig, max(seen, key=len))
+        pair = max(seen, key=len)
+    a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
+    found = remedies(rig, cam_from_rig, pair, shifted)
+    if found:
+        raise ExplainedInputError(
+            f"cameras {a!r} and {b!r} contradict their images: probably "
+            f"{_words(found)}; else cam_from_rig of {b!r} is wrong",
+            tuple(found),
+        )
+    if turn > MAX_TURN_DEG:
         raise InputError(
             f"cam_from_rig of camera {rig.cameras[worst].name!r} does not fit the "
-            f"images: it would have to turn by {rotation.turn_deg[worst]:.0f} degrees "
-            f"or more, which no tilted port explains; {POSE_HINT}"
+            f"images: it would have to turn by {turn:.0f} degrees or more, which no "
+            f"tilted port explains; {POSE_HINT}"
         )
-    if rotation.misfit_after > MAX_REST:
-        pair = max(pairs, key=len)
-        _check_ports(rig, cam_from_rig, pair)
-        names = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
-        raise _misfit_error(*names, rotation.misfit_after)
+    raise _misfit_error(a, b, rotation.misfit_after)
 
 
 def fit_of(
@@ -144,99 +187,158 @@ def _misfit_error(name_a: str, name_b: str, misfit: float) -> InputError:
     )
 
 
-def _check_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> None:
-    """Refuse cameras without a port, where ports would make them fit."""
-    a, b = pair.camera_a, pair.camera_b
-    ideas = _missing_ports(rig, pair, relative_pose(cam_from_rig, a, b))
-    for phrase, idea in ideas.items():
-        if _turn_needed(*idea) <= MAX_TURN_DEG:
-            raise InputError(
-                f"cameras {rig.cameras[a].name!r} and {rig.cameras[b].name!r} "
-                f"contradict their images: probably {phrase}; else cam_from_rig of "
-                f"{rig.cameras[b].name!r} is wrong"
-            )
-
-
-def _check_counts(rig: Rig, pairs: Sequence[PairMatches]) -> None:
+def _check_counts(
+    rig: Rig,
+    cam_from_rig: Array,
+    pairs: Sequence[PairMatches],
+    shifted: Shifted | None,
+) -> None:
     best = max(pairs, key=len)
-    if len(best) < MIN_RIG_MATCHES:
-        a, b = rig.cameras[best.camera_a].name, rig.cameras[best.camera_b].name
-        raise InputError(
-            f"cameras {a!r} and {b!r} share only {len(best)} matches in all frames, at "
-            f"least {MIN_RIG_MATCHES} are needed: do their images overlap, were images "
-            "of equal names taken at the same time, is the water clear enough?"
-        )
-
-
-_Idea = tuple[tuple[RefractiveCamera, RefractiveCamera], Array, tuple[Array, Array]]
-"""Two cameras, the second from the first (7,), and matched pixels (N, 2) of both."""
-
-
-def _remedies(rig: Rig, pair: PairMatches, b_from_a: Array) -> list[str]:
-    """What to change, one phrase each: the explanations that tilted ports allow."""
-    a, b = rig.cameras[pair.camera_a], rig.cameras[pair.camera_b]
-    given = pair.xy_a, pair.xy_b
-    cameras = rig.refractive_cameras()
-    both = cameras[pair.camera_a], cameras[pair.camera_b]
-    ideas: dict[str, _Idea] = {
-        f"the image folders {a.images!r} and {b.images!r} are swapped: exchange them "
-        "in rig.yaml": (both, b_from_a, given[::-1])
-    }
-    if pair.camera_a == 0:  # the pose of a camera in the rig, not a relative one
-        ideas[
-            f"cam_from_rig of {b.name!r} is inverted: it must map from the rig to the "
-            "camera (x_in_cam = R x_in_rig + translation_m)"
-        ] = (both, rigid3.inverse(b_from_a), given)
-        as_position = b_from_a.copy()
-        as_position[4:] = -rigid3.rotate(b_from_a, b_from_a[4:])
-        ideas[
-            f"translation_m of {b.name!r} is the position of the camera: it must be "
-            "-R times that"
-        ] = (both, as_position, given)
-    ideas |= _missing_ports(rig, pair, b_from_a)
-    turns = {phrase: _turn_needed(*idea) for phrase, idea in ideas.items()}
-    likely = sorted(turns, key=lambda phrase: turns[phrase])
-    limit = min(MAX_TURN_DEG, turns[likely[0]] + SAME_TURN_DEG)
-    return [phrase for phrase in likely if turns[phrase] <= limit]
-
-
-def _missing_ports(rig: Rig, pair: PairMatches, b_from_a: Array) -> dict[str, _Idea]:
-    """A lens that was calibrated in air, and that nobody said is behind a port.
-
-    Any flat port will do for it: what it does to rays is mostly the water's.
-    """
-    sides = pair.camera_a, pair.camera_b
-    bare = [c for c in sides if isinstance(rig.cameras[c].port, NoPort)]
-    if not bare:
-        return {}
-    cameras = list(rig.refractive_cameras())
-    for c in bare:
-        cameras[c] = cameras[c].with_port(FlatPort())
-    phrase = (
-        f"the port of {' and '.join(repr(rig.cameras[c].name) for c in bare)} is "
-        "missing in the rig file, where type none is for a lens that was calibrated in "
-        "the water, not in air"
+    if len(best) >= MIN_RIG_MATCHES:
+        return
+    a, b = rig.cameras[best.camera_a].name, rig.cameras[best.camera_b].name
+    few = (
+        f"cameras {a!r} and {b!r} share only {len(best)} matches in all frames, at "
+        f"least {MIN_RIG_MATCHES} are needed: "
     )
-    both = cameras[sides[0]], cameras[sides[1]]
-    return {phrase: (both, b_from_a, (pair.xy_a, pair.xy_b))}
+    found = _likely(_shift_ideas(rig, cam_from_rig, best, shifted))
+    if found:
+        raise ExplainedInputError(f"{few}probably {_words(found)}", tuple(found))
+    raise InputError(
+        f"{few}do their images overlap, were images of equal names taken at the same "
+        "time, is one camera mirrored, is the water clear enough?"
+    )
 
 
-def _turn_needed(
-    cameras: tuple[RefractiveCamera, RefractiveCamera],
-    b_from_a: Array,
-    pixels: tuple[Array, Array],
-) -> float:
+@dataclass(frozen=True)
+class _Idea:
+    """An explanation, and how well two cameras fit their matches with it."""
+
+    code: str
+    phrase: str
+    turn_deg: float
+    misfit: float
+    """Median angle between rays and their epipolar plane after the turn, radians."""
+
+    def badness(self, best_misfit: float) -> float:
+        return self.turn_deg / SAME_TURN_DEG + math.log(
+            max(self.misfit, LEAST_MISFIT) / max(best_misfit, LEAST_MISFIT)
+        ) / math.log(SAME_MISFIT)
+
+
+def remedies(
+    rig: Rig,
+    cam_from_rig: Array,
+    pair: PairMatches,
+    shifted: Shifted | None = None,
+) -> dict[str, str]:
+    """The mistakes that explain the matches of two cameras, and what to change.
+
+    Args:
+        rig: As given.
+        cam_from_rig: Poses (C, 7) of its cameras.
+        pair: Matches of two of them.
+        shifted: As of `check_rig`.
+
+    Returns:
+        Clauses by the names of the mistakes, likeliest first; empty if none explains.
+    """
+    posed = replace(
+        rig,
+        cam_from_rig=cam_from_rig,
+        baseline_m=float(np.linalg.norm(cam_from_rig[1, 4:])),
+    )
+    undone = [*corrections(posed), *focal_corrections(posed)]
+    ideas = [_idea(item, _corrected(item, pair)) for item in undone]
+    ideas += _shift_ideas(rig, cam_from_rig, pair, shifted)
+    given = _idea(Correction(code="", rig=posed, what="", remedy=""), pair)
+    least = min([LEAST_MISFIT, *(idea.misfit for idea in ideas)])
+    limit = given.badness(least) - CLEARLY_BETTER
+    return _likely([idea for idea in ideas if idea.badness(least) <= limit])
+
+
+def _corrected(correction: Correction, pair: PairMatches) -> PairMatches:
+    """Two cameras' matches once the images are put right."""
+    sizes = np.array(
+        [(c.camera.width, c.camera.height) for c in correction.rig.cameras]
+    )
+    sides = (pair.camera_a, pair.xy_a), (pair.camera_b, pair.xy_b)
+    (a, xy_a), (b, xy_b) = (
+        corrected_pixels(correction, sizes, np.full(len(xy), camera), xy)
+        for camera, xy in sides
+    )
+    if a[0] > b[0]:
+        a, xy_a, b, xy_b = b, xy_b, a, xy_a
+    return replace(pair, camera_a=int(a[0]), camera_b=int(b[0]), xy_a=xy_a, xy_b=xy_b)
+
+
+def _shift_ideas(
+    rig: Rig, cam_from_rig: Array, pair: PairMatches, shifted: Shifted | None
+) -> list[_Idea]:
+    """One camera late or early: matches with neighbouring frames fit the rig."""
+    if shifted is None:
+        return []
+    ideas = []
+    posed = replace(
+        rig,
+        cam_from_rig=cam_from_rig,
+        baseline_m=float(np.linalg.norm(cam_from_rig[1, 4:])),
+    )
+    sides = pair.camera_a, pair.camera_b
+    for shift in SHIFTS:
+        for other in shifted(shift):
+            if (other.camera_a, other.camera_b) != sides:
+                continue
+            if len(other) < max(MIN_RIG_MATCHES, len(pair) // 4):
+                continue
+            what, remedy = shift_words(rig.cameras[sides[1]].name, -shift)
+            late = Correction(
+                code="frames_shifted", rig=posed, what=what, remedy=remedy
+            )
+            ideas.append(_idea(late, other))
+    return ideas
+
+
+def _words(found: Mapping[str, str]) -> str:
+    return " or ".join(found.values())
+
+
+def _likely(ideas: Sequence[_Idea]) -> dict[str, str]:
+    """The explanations that tilted ports allow and that fit best, one of each kind."""
+    fitting = [i for i in ideas if i.turn_deg <= MAX_TURN_DEG and i.misfit <= MAX_REST]
+    if not fitting:
+        return {}
+    least = min(idea.misfit for idea in fitting)
+    fitting.sort(key=lambda idea: idea.badness(least))
+    limit = fitting[0].badness(least) + 1.0
+    phrases: dict[str, str] = {}
+    for idea in fitting:
+        if idea.badness(least) <= limit:
+            phrases.setdefault(idea.code, idea.phrase)
+    return dict(list(phrases.items())[:MAX_PHRASES])
+
+
+def _idea(correction: Correction, pair: PairMatches) -> _Idea:
     """By how many degrees the second camera must turn to fit; inf if it never does."""
-    in_front, misfit = fit_of(*cameras, b_from_a, *pixels)
+    rig = correction.rig
+    assert rig.cam_from_rig is not None
+    phrase = f"{correction.what}: {correction.remedy}"
+    step = -(-len(pair) // IDEA_MATCHES)
+    xy_a, xy_b = pair.xy_a[::step], pair.xy_b[::step]
+    both = rig.refractive_cameras()
+    cameras = both[pair.camera_a], both[pair.camera_b]
+    b_from_a = relative_pose(rig.cam_from_rig, pair.camera_a, pair.camera_b)
+    in_front, misfit = fit_of(*cameras, b_from_a, xy_a, xy_b)
     if in_front < CLEARLY_IN_FRONT or misfit > MAX_MISFIT:
-        return np.inf
-    pair = PairMatches(
+        return _Idea(correction.code, phrase, np.inf, np.inf)
+    thinned = PairMatches(
         camera_a=0,
         camera_b=1,
-        frame_idx=np.zeros(len(pixels[0]), dtype=np.int64),
-        xy_a=pixels[0],
-        xy_b=pixels[1],
+        frame_idx=np.zeros(len(xy_a), dtype=np.int64),
+        xy_a=xy_a,
+        xy_b=xy_b,
     )
     poses = np.stack([rigid3.IDENTITY, b_from_a])
-    rotation = correct_rotations(cameras, poses, [pair])
-    return float(rotation.turn_deg[1]) if rotation.misfit_after <= MAX_REST else np.inf
+    rotation = correct_rotations(cameras, poses, [thinned])
+    turn = float(rotation.turn_deg[1])
+    return _Idea(correction.code, phrase, turn, rotation.misfit_after)

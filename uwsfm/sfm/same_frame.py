@@ -45,13 +45,21 @@ class PairMatches:
 
 
 def read_same_frame_matches(
-    database_path: Path, frames: Frames, rig: Rig
+    database_path: Path, frames: Frames, rig: Rig, shift: int = 0
 ) -> list[PairMatches]:
     """Matches of the same frame that agree with one epipolar geometry per frame.
 
     Neither the rig's poses nor the distance of a port is used. The essential matrix is
     robustly fitted to the directions of the water rays, in which the lens distortion
-    and nearly all of the refraction are undone.
+    and nearly all of the refraction are undone. Pixels beyond a camera's
+    ``valid_radius_px`` take no part: their rays would be wrong.
+
+    Args:
+        database_path: Keypoints and raw matches.
+        frames: The images.
+        rig: Lenses and ports.
+        shift: Frame f of the first camera is matched with frame f + shift of the
+            second: what fits where the second is so many frames late.
 
     Returns:
         One entry per pair of cameras, those without a match included.
@@ -66,13 +74,18 @@ def read_same_frame_matches(
         ids = {image.name: image.image_id for image in database.read_all_images()}
         for a, b in combinations(range(len(cameras)), 2):
             rows = []
-            for f in chosen.tolist():
-                id_a, id_b = ids[frames.image_name(a, f)], ids[frames.image_name(b, f)]
+            for f in chosen[
+                (chosen >= -shift) & (chosen < num_frames - shift)
+            ].tolist():
+                id_a = ids[frames.image_name(a, f)]
+                id_b = ids[frames.image_name(b, f + shift)]
                 matches = database.read_matches(id_a, id_b)
                 if len(matches) < MIN_MATCHES:
                     continue
                 xy_a = _keypoints(database, id_a)[matches[:, 0]]
                 xy_b = _keypoints(database, id_b)[matches[:, 1]]
+                covered = rig.cameras[a].covers(xy_a) & rig.cameras[b].covers(xy_b)
+                xy_a, xy_b = xy_a[covered], xy_b[covered]
                 good = _epipolar_inliers(cameras[a], cameras[b], xy_a, xy_b)
                 frame = np.full((int(good.sum()), 1), float(f))
                 rows.append(np.hstack([frame, xy_a[good], xy_b[good]]))

@@ -71,10 +71,14 @@ def same_frame_scene(rig: Rig, frames: Frames, database_path: Path) -> Scene:
             "in rig.yaml, a baseline length is not enough"
         )
     pairs = read_same_frame_matches(database_path, frames, rig)
-    check_rig(rig, rig.cam_from_rig, pairs)
+
+    def shifted(shift: int) -> list[PairMatches]:
+        return read_same_frame_matches(database_path, frames, rig, shift)
+
+    check_rig(rig, rig.cam_from_rig, pairs, shifted)
     cameras = rig.refractive_cameras()
     rotation = correct_rotations(cameras, rig.cam_from_rig, pairs)
-    check_rotation(rig, rig.cam_from_rig, rotation, pairs)
+    check_rotation(rig, rig.cam_from_rig, rotation, pairs, shifted)
     good = []
     for pair in pairs:
         if len(pair) < MIN_RIG_MATCHES:

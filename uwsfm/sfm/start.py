@@ -246,6 +246,7 @@ def _rig_content(rig: Rig) -> list[Any]:
             item.camera.height,
             np.asarray(item.camera.params).tolist(),
             item.port.row.tolist(),
+            item.valid_radius_px,
         ]
         for item in rig.cameras
     ]

@@ -35,6 +35,9 @@ class ReducedCovariance:
     """(F, 6, B) of free frames and border."""
     whole_border: Array
     """(B, B), lengths included."""
+    poses: Array
+    """(F, 6, 6) of each frame in its own place: the block of its pose in the reduced
+    system itself, zero if held."""
     found: Inverse | None
 
     @property
@@ -64,10 +67,7 @@ class ReducedCovariance:
     @property
     def frames(self) -> Array:
         """(F, 6, 6) blocks of the poses, tangents of `rigid3.perturb`; zero if held."""
-        graph = self.reduction.graph
-        blocks = np.zeros((len(self.layout.frame_col), 6, 6))
-        blocks[graph.frame] = self.blocks[graph.row_start[1:] - 1]
-        return blocks
+        return _diagonal(self.reduction, self.blocks)
 
     def variance_of(self, slope: Array) -> float:
         """Variance of what changes by slope (n,) times the unknowns; NaN if singular.
@@ -77,6 +77,14 @@ class ReducedCovariance:
         if self.found is None:
             return math.nan
         return float(slope @ self.found.times(slope[:, None])[:, 0])
+
+
+def _diagonal(reduction: Reduction, blocks: Array) -> Array:
+    """(F, 6, 6) diagonal blocks, by frame; zero if held."""
+    graph = reduction.graph
+    by_frame = np.zeros((len(reduction.layout.frame_col), 6, 6))
+    by_frame[graph.frame] = blocks[graph.row_start[1:] - 1]
+    return by_frame
 
 
 def reduced_covariance(
@@ -92,6 +100,7 @@ def reduced_covariance(
     """
     reduction = reduction or analyse(layout)
     system = schur.reduced_system(layout, reduction.graph, eqs, 0.0)
+    poses = _diagonal(reduction, system.blocks)
     found = inverse(reduction, system, layout.num_lengths)
     if found is None:
         blocks, border = (
@@ -107,6 +116,7 @@ def reduced_covariance(
         blocks=blocks,
         coupling=np.ascontiguousarray(coupling),
         whole_border=np.ascontiguousarray(border),
+        poses=poses,
         found=found,
     )
 

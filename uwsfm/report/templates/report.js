@@ -137,6 +137,18 @@
     }));
   });
 
+  (data.halves ?? []).forEach((px, index) => {
+    const size = data.residuals[index].size, id = `halves-${index}`;
+    figure(id, (color) => ({
+      traces: [{
+        type: "heatmap", z: px, zmin: 0, zmax: data.halves_limit, colorscale: scale(color),
+        x: centers(size[0], px[0].length), y: centers(size[1], px.length), hoverongaps: false,
+        colorbar: bar(color, "difference (px)"), hovertemplate: "%{z:.3f} px<extra></extra>",
+      }],
+      frame: layout(color, { height: mapHeight(id, size), ...imageAxes(color, size) }),
+    }));
+  });
+
   figure("cost", (color) => {
     let first = 0;
     const traces = data.solves.map((solve, k) => {

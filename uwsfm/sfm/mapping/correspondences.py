@@ -166,11 +166,10 @@ def read_correspondences(
             pairs.append(first[[a, b]] + matches.astype(np.int64))
             flags.append(in_rows(matches, good.get(pair_id, matches[:0])))
     xy, image = np.concatenate(rows), np.repeat(np.arange(len(rows)), counts)
-    radii = [item.valid_radius_px for item in rig.cameras]
-    limits = np.array([np.inf if radius is None else radius for radius in radii])
-    centers = np.array([camera.lens[2:4] for camera in rig.refractive_cameras()])
-    offset = np.linalg.norm(xy - centers[image % num_cameras], axis=1)
-    usable = offset <= limits[image % num_cameras]
+    usable = np.ones(len(xy), dtype=bool)
+    for index, camera in enumerate(rig.cameras):
+        own = image % num_cameras == index
+        usable[own] = camera.covers(xy[own])
     all_matches = np.concatenate(pairs)
     kept = usable[all_matches].all(axis=1)
     return Correspondences(

@@ -6,9 +6,9 @@ import numpy as np
 from sfm_scenes import simulated_dive
 
 from uwsfm import NoPort
-from uwsfm.report.central import fit_central
-from uwsfm.report.residuals import FEWEST, camera_residuals
 from uwsfm.simulate.rigs import sample_rig
+from uwsfm.trust.central import fit_central
+from uwsfm.trust.residuals import FEWEST, camera_residuals
 
 
 def bare(scene):

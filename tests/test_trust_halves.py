@@ -1,0 +1,233 @@
+"""Cross-validation: halves of the frames agree where the model is right, and show by
+how much they differ where it is not."""
+
+import io
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from uwsfm import UwsfmError, calibrate
+from uwsfm.check_halves import check_halves
+from uwsfm.cli import app
+from uwsfm.cli_check import halves_table
+from uwsfm.export.halves_summary import KEY, halves_numbers, with_cross_validation
+from uwsfm.export.summary import housing_summary, scale_summary
+from uwsfm.geometry import rigid3
+from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
+from uwsfm.simulate.rigs import nominal_rig, sample_rig
+from uwsfm.simulate.trajectories import rich_motion
+from uwsfm.trust.halves import IN_ORDER, INTERLEAVED, CrossValidation, cross_validate
+from uwsfm.trust.projections import projection_map
+from uwsfm.trust.shared_numbers import shared_numbers
+
+RIG = nominal_rig(sample_rig())
+NUM_FRAMES = 12
+
+
+def dive(noise_px=0.3, num_frames=NUM_FRAMES):
+    options = ObservationOptions(num_points=300, noise_px=noise_px)
+    return simulate_scene(
+        sample_rig(), rich_motion(num_frames), Relief(stddev=0.2), options
+    )
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return calibrate(dive().scene, loss="l2")
+
+
+@pytest.fixture(scope="module")
+def right(solved) -> CrossValidation:
+    return cross_validate(RIG, solved)
+
+
+@pytest.fixture(scope="module")
+def remounted() -> CrossValidation:
+    """The right port is mounted anew midway, 10 mm farther away."""
+    truth = dive().truth
+    moved = truth.cameras[1].with_port(replace(truth.ports[1], distance=0.030))
+    late = (truth.frame_idx >= NUM_FRAMES // 2) & (truth.camera_idx == 1)
+    other = replace(truth, cameras=(truth.cameras[0], moved)).projections()[0]
+    rng = np.random.default_rng(0)
+    xy = np.where(late[:, None], other, truth.xy) + rng.normal(0.0, 0.1, truth.xy.shape)
+    return cross_validate(RIG, calibrate(replace(truth, xy=xy), loss="l2"))
+
+
+def split_of(found: CrossValidation, name: str):
+    (split,) = (each for each in found.splits if each.name == name)
+    return split
+
+
+def test_halves_are_disjoint_and_whole(right, solved):
+    for split in right.splits:
+        assert sum(split.num_frames) == NUM_FRAMES
+        # Points that one half sees once are left out of it.
+        count = sum(split.num_observations)
+        assert 0.97 * solved.scene.num_observations < count
+        assert count <= solved.scene.num_observations
+    assert [split.name for split in right.splits] == [INTERLEAVED, IN_ORDER]
+
+
+def test_nothing_is_enlarged_where_the_model_is_right(right):
+    """40 such dives: ratios of 0.87 to 0.98 RMS, none enlarged."""
+    assert right.enlarged == {}
+    groups = {each.group for each in right.splits[0].agreements}
+    assert groups == {"tilt", "distance", "rotation", "direction", "length", "scale"}
+    for split in right.splits:
+        for each in split.agreements:
+            assert each.num_independent >= 1.0
+            assert 0.005 < each.p_value < 0.995
+
+
+def test_a_port_that_moved_midway_is_seen(remounted):
+    """First against second are two rigs; interleaved halves are of both."""
+    numbers = split_of(remounted, IN_ORDER).numbers
+    left, right = (n for n in numbers if n.group == "distance")
+    # What both ports have in common is known to 1.5 mm, what they differ by to 0.4.
+    assert right.difference - left.difference == pytest.approx(10.0, abs=1.5)
+    assert remounted.enlarged["distance"] > 2.0
+    by_group = {
+        each.group: each.ratio for each in split_of(remounted, IN_ORDER).agreements
+    }
+    assert by_group["distance"] == max(by_group.values())
+    # Groups are judged by the worse split.
+    for group, factor in remounted.enlarged.items():
+        ratios = [
+            each.ratio
+            for split in remounted.splits
+            for each in split.agreements
+            if each.group == group
+        ]
+        assert factor == max(ratios)
+
+
+def test_numbers_differ_as_their_halves_do(solved):
+    """Values, differences and deviations against the calibrations themselves."""
+    other = calibrate(dive(noise_px=0.2).scene, loss="l2")
+    found = shared_numbers(solved, other, ["left", "right"])
+    by_name = {number.name: number for number in found.numbers}
+    distance = by_name["port distance of right"]
+    values = [1e3 * r.scene.ports[1].distance for r in (solved, other)]
+    assert distance.values == pytest.approx(values, rel=1e-12)
+    known = [r.covariance.cameras[1].distance_stddev_m for r in (solved, other)]
+    # The same matrices, from the optimum and from the optimum opened again.
+    assert distance.stddev == pytest.approx(1e3 * np.hypot(*known), rel=1e-3)
+    normals = [r.scene.ports[0].normal for r in (solved, other)]
+    tilt = by_name["tilt x of left"]
+    assert tilt.values == pytest.approx(np.degrees(np.arcsin([n[0] for n in normals])))
+    both = [
+        np.sum([by_name[f"tilt {axis} of left"].stddev ** 2 for axis in "xy"]),
+        np.sum(
+            [r.covariance.cameras[0].normal_stddev_deg ** 2 for r in (solved, other)]
+        ),
+    ]
+    # Two components make the angle. Each is raised to what neighbours share by itself,
+    # the angle as a whole: one component may be raised alone.
+    assert both[1] <= 1.001 * both[0] < 1.1 * both[1]
+    turn = rigid3.compose(
+        other.scene.cam_from_rig[1], rigid3.inverse(solved.scene.cam_from_rig[1])
+    )
+    turned = [by_name[f"rotation {axis} of right"].difference for axis in "xyz"]
+    angle = np.degrees(rigid3.rotation_angle(turn))
+    assert np.linalg.norm(turned) == pytest.approx(float(angle), rel=1e-6)
+
+
+def test_projections_know_nothing_of_the_frame_of_the_rig():
+    """A rig that is moved as a whole projects as before; a focal length does not."""
+    truth = dive(noise_px=0.0).truth
+    same = projection_map(truth, truth, truth, RIG, with_scale=False)
+    assert np.nanmax(same.px) < 1e-6 and np.nanmax(same.mm) < 1e-6
+    larger = replace(
+        truth,
+        cam_from_rig=np.hstack(
+            [truth.cam_from_rig[:, :4], 1.02 * truth.cam_from_rig[:, 4:]]
+        ),
+        cameras=tuple(
+            c.with_port(
+                replace(
+                    c.port,
+                    distance=1.02 * c.port.distance,
+                    thickness=1.02 * c.port.thickness,
+                )
+            )
+            for c in truth.cameras
+        ),
+    )
+    scaled = projection_map(truth, larger, truth, RIG, with_scale=True)
+    assert np.nanmax(scaled.px) < 1e-5  # all lengths by one factor: no image changes
+    held = projection_map(truth, larger, truth, RIG, with_scale=False)
+    # 2 % of a disparity of 100 px, of which the motion takes what is common.
+    assert held.rms_px(0) > 0.1
+
+
+def test_projections_of_a_turned_port_are_off_by_as_much_as_pixels_are():
+    """Against the projections of the scene's own points, the poses held."""
+    truth = dive(noise_px=0.0).truth
+    bent = truth.cameras[1].with_port(replace(truth.ports[1], distance=0.030))
+    second = replace(truth, cameras=(truth.cameras[0], bent))
+    found = projection_map(truth, second, truth, RIG, with_scale=False)
+    moved = (second.projections()[0] - truth.xy)[truth.camera_idx == 1]
+    held = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+    # The best motion of the rig takes part of it, and cannot add any.
+    right = np.sqrt(np.nanmean(found.px[1] ** 2))
+    assert 0.0 < right < held
+    # Across the ray: pixels times range over the focal length in water. Rays of the
+    # middle cells are slanted by less than 4 degrees, and begin 3 cm from a centre.
+    focal = 1.333 * truth.cameras[1].lens[0]
+    expected = found.px[1, 1] * 1e3 * found.ranges_m[1] / focal
+    ratio = (found.mm[1, 1] / expected)[2:4, 3:5]
+    assert np.all(np.abs(ratio - 1.0) < 0.03)
+
+
+def test_deviations_in_the_summary_are_enlarged_once(remounted, solved):
+    names = RIG
+    summary = {
+        "cameras": housing_summary(names, solved),
+        "scale": scale_summary(solved),
+        "warnings": [],
+    }
+    once = with_cross_validation(summary, remounted)
+    factor = remounted.enlarged["distance"]
+    own = [s["cameras"][0]["distance_stddev_m"] for s in (summary, once)]
+    assert own[1] == pytest.approx(factor * own[0])
+    assert f"enlarged by {factor:.1f}" in " ".join(once[KEY]["sentences"])
+    twice = with_cross_validation(once, remounted)
+    again = twice["cameras"][0]["distance_stddev_m"]
+    assert again == pytest.approx(own[1])  # not once more
+    numbers = halves_numbers(remounted)["splits"][1]["numbers"]
+    assert {n["name"] for n in numbers} >= {"port distance of right", "tilt x of left"}
+
+
+def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
+    """As the run itself did it; the table shows what the summary holds."""
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    before = json.loads((out / "summary.json").read_text())
+    bare = {key: value for key, value in before.items() if key != KEY}
+    (out / "summary.json").write_text(json.dumps(bare))
+    shown = CliRunner().invoke(app, ["check", str(out), "--halves"])
+    assert shown.exit_code == 0, shown.output
+    numbers = check_halves(out)
+    after = json.loads((out / "summary.json").read_text())
+    assert after[KEY] == json.loads(json.dumps(numbers))
+    for split, first in zip(numbers["splits"], before[KEY]["splits"], strict=True):
+        assert split["num_frames"] == [3, 3]
+        for one, two in zip(split["numbers"], first["numbers"], strict=True):
+            # Read from files of doubles: the same to the solver's last step.
+            assert one["z"] == pytest.approx(two["z"], abs=1e-3)
+    shown = io.StringIO()
+    Console(file=shown, width=150).print(halves_table(numbers))
+    ratio = numbers["splits"][0]["agreements"][0]["ratio"]
+    assert "port tilts" in shown.getvalue() and f"{ratio:.2f} (p" in shown.getvalue()
+    assert numbers["sentences"][0] in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_few_frames_are_refused_with_the_number_that_is_needed():
+    few = calibrate(dive(num_frames=5).scene, loss="l2")
+    with pytest.raises(UwsfmError, match="has 5 frames: halves .* need 6 or more"):
+        cross_validate(RIG, few)

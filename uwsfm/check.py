@@ -1,0 +1,81 @@
+"""`uwsfm check`: is a result to be trusted, and if not, which mistake explains it?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uwsfm._progress import Progress, silent
+from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import RUN_AGAIN
+from uwsfm.export.files import RIG_GIVEN
+from uwsfm.export.summary import write_json
+from uwsfm.result_folder import open_result
+from uwsfm.rig import Rig
+from uwsfm.rig_file import load_rig
+from uwsfm.trust.diagnosis import Explanation, diagnose, options_of
+
+CHECK = "check.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What a check found; the same is in `CHECK`."""
+
+    verdict: str | None
+    """Of the result, see `uwsfm.trust.verdict`; None: of a version that gave none."""
+    reasons: tuple[dict[str, Any], ...]
+    """Of that verdict."""
+    explanations: tuple[Explanation, ...]
+    """Mistakes that explain the observations, best first; none where the rig fits."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "explanations": [one.to_json() for one in self.explanations],
+        }
+
+
+def check_result(out: str | Path, progress: Progress = silent) -> Check:
+    """Look for the mistake that explains a result, whatever its verdict.
+
+    Args:
+        out: Folder that `reconstruct`, `refine_model` or `run_demo` wrote; receives
+            ``check.json``.
+        progress: Called with each trial.
+
+    Raises:
+        InputError: the folder is not such a one, or lacks the rig file as given.
+    """
+    result = open_result(out)
+    rig = given_rig(result.folder)
+    model, summary = result.model, result.summary
+    found = Check(
+        verdict=summary.get("verdict"),
+        reasons=tuple(summary.get("reasons", ())),
+        explanations=diagnose(
+            rig,
+            model.scene,
+            model.frame_names,
+            progress,
+            **options_of(result.calibration),
+        ),
+    )
+    write_json(found.to_json(), result.folder / CHECK)
+    return found
+
+
+def given_rig(folder: Path) -> Rig:
+    """The rig as it was given for a result.
+
+    Raises:
+        InputError: the folder does not have it.
+    """
+    path = folder / RIG_GIVEN
+    if not path.is_file():
+        raise InputError(
+            f"{path} is missing: the rig as given is not known; {RUN_AGAIN}"
+        )
+    return load_rig(path)

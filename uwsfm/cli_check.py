@@ -1,0 +1,112 @@
+"""`uwsfm check`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from uwsfm.trust.diagnosis import Explanation
+
+
+def check(
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="The output of uwsfm reconstruct, refine or demo."
+        ),
+    ],
+    halves: Annotated[
+        bool,
+        typer.Option(
+            "--halves",
+            help="Compare disjoint halves of the frames instead, each adjusted alone.",
+        ),
+    ] = False,
+) -> None:
+    """Look for the mistake that explains a result that does not fit.
+
+    Each mistake that people make in a rig file or with their images is undone and the
+    result adjusted again: what explains the images clearly better is named.
+    """
+    if halves:
+        _check_halves(out)
+        return
+    from uwsfm._signals import BEGINS_AGAIN
+    from uwsfm.console import ProgressBars
+
+    with ProgressBars(BEGINS_AGAIN) as progress:
+        from uwsfm.check import CHECK, check_result
+
+        found = check_result(out, progress)
+    from uwsfm.console import console, print_verdict
+    from uwsfm.export.files import read_summary
+
+    print_verdict({**(read_summary(out) or {}), "explanations": ()})
+    if found.explanations:
+        console.print(explanations_table(found.explanations))
+    else:
+        console.print("No mistake explains the images better than the rig as given.")
+    typer.echo(f"written: {out / CHECK}")
+
+
+def _check_halves(out: Path) -> None:
+    from uwsfm.check_halves import check_halves
+    from uwsfm.console import console
+    from uwsfm.export.files import SUMMARY
+
+    found = check_halves(out)
+    console.print(halves_table(found))
+    for sentence in found["sentences"]:
+        console.print(sentence, markup=False)
+    typer.echo(f"written: {out / SUMMARY}")
+
+
+def explanations_table(explanations: Iterable[Explanation]) -> Table:
+    """Mistakes that explain the images, each with its evidence."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title="Error of the best 90 % of the observations, RMS (px)",
+        title_justify="left",
+    )
+    table.add_column("mistake", no_wrap=True)
+    table.add_column("as given", justify="right", no_wrap=True)
+    table.add_column("without it", justify="right", no_wrap=True)
+    table.add_column("evidence and remedy")
+    for one in explanations:
+        before, after = f"{one.rms_before_px:.2f}", f"{one.rms_after_px:.2f}"
+        table.add_row(one.code.replace("_", " "), before, after, Text(one.text))
+    return table
+
+
+def halves_table(cross_validation: dict[str, Any]) -> Table:
+    """How far the halves of the frames differ, over what they predict."""
+    from rich.table import Table
+
+    from uwsfm.export.halves_summary import NAMES
+
+    table = Table(
+        title="Halves of the frames: difference over prediction (1 is right)",
+        title_justify="left",
+    )
+    table.add_column("numbers")
+    splits = cross_validation["splits"]
+    for split in splits:
+        table.add_column(split["name"], justify="right", no_wrap=True)
+    table.add_column("enlarged by", justify="right", no_wrap=True)
+    rows: dict[str, list[str]] = {}
+    for k, split in enumerate(splits):
+        for row in split["agreements"]:
+            cells = rows.setdefault(row["group"], len(splits) * ["-"])
+            cells[k] = f"{row['ratio']:.2f} (p = {row['p_value']:.2g})"
+    for group, cells in rows.items():
+        factor = cross_validation["enlarged"].get(group)
+        table.add_row(NAMES[group], *cells, "" if factor is None else f"{factor:.1f}")
+    return table

@@ -1,0 +1,65 @@
+"""The cross-validation of a summary, as the page and the pictures show it."""
+
+from typing import Any
+
+import numpy as np
+
+from uwsfm.export.halves_summary import KEY, NAMES
+
+
+def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
+    """Sentences, rows of the table, and what the maps are of; None without any."""
+    found = summary.get(KEY)
+    if not found or not found.get("splits"):
+        return None
+    worse = _worse(found["splits"])
+    maps, unit = worse["projections"], found["unit"]
+    small = "mm" if unit == "m" else "thousandths of a unit"
+    others = [
+        f"{px:.2g} px, {mm:.2g} {small} at {far:.2g} {unit}"
+        for far, px, mm in zip(
+            maps["ranges_m"], maps["rms_px"], maps["rms_mm"], strict=True
+        )
+    ]
+    return {
+        "sentences": found["sentences"],
+        "rows": [
+            {
+                "split": split["name"],
+                "numbers": NAMES[row["group"]],
+                "ratio": f"{row['ratio']:.2f}",
+                "chance": _chance(row["p_value"]),
+            }
+            for split in found["splits"]
+            for row in split["agreements"]
+        ],
+        "split": worse["name"],
+        "range": f"{maps['ranges_m'][_middle(maps)]:.2g} {unit}",
+        "ranges": f"RMS over all cameras: {'; '.join(others)}.",
+    }
+
+
+def halves_payload(summary: dict[str, Any]) -> dict[str, Any]:
+    """What the script draws: a map (rows, columns) per camera, and its darkest, px."""
+    found = summary.get(KEY)
+    if not found or not found.get("splits"):
+        return {}
+    maps = _worse(found["splits"])["projections"]
+    middle = [camera[_middle(maps)] for camera in maps["px"]]
+    values = np.array(middle, dtype=np.float64)
+    known = values[np.isfinite(values)]
+    largest = float(np.percentile(known, 95.0)) if len(known) else 1.0
+    return {"halves": middle, "halves_limit": max(largest, 1e-3)}
+
+
+def _worse(splits: list[dict[str, Any]]) -> dict[str, Any]:
+    """The split that projects farther apart."""
+    return max(splits, key=lambda split: max(split["projections"]["rms_px"]))
+
+
+def _middle(maps: dict[str, Any]) -> int:
+    return len(maps["ranges_m"]) // 2
+
+
+def _chance(p_value: float) -> str:
+    return "< 0.1 %" if p_value < 1e-3 else f"{100.0 * p_value:.2g} %"

@@ -1,0 +1,150 @@
+"""Numbers that have left what was given, as reasons of a verdict."""
+
+import math
+from collections.abc import Sequence
+
+from uwsfm.trust.given import Departure
+from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, reason
+
+DEPARTED, FAR_DEPARTED = 4.0, 10.0
+"""Standard deviations of given and estimate together; and of what was given alone, for
+an estimate that is moved towards it by three of its own. For a port distance whose
+accuracy was not stated they are factors of 3 and 6."""
+TILTED_DEG, FAR_TILTED_DEG = 15.0, 25.0
+"""A port turned by more against the normal given: no mount is so far off by chance, and
+at the second the port would stand in the way of its own lens."""
+DOME_SHARE, FAR_DOME_SHARE = 0.5, 0.85
+"""Distance of a dome's centre from the lens, by its radius: at 1 the pupil is in the
+glass, and a lens body has a radius too."""
+LONGEST_DISTANCE_M, READABLE_DISTANCE_M = 0.25, 0.5
+"""No housing has a longer way from lens to port; no rig file takes one."""
+STRETCH = (0.5, 1.45)
+"""Of a lens at the image's edge. Wide lenses have 0.6; a flat port, taken for lens
+distortion, 1.3 at the edge of a field of 100 degrees. No lens has more."""
+CONTRADICTED = 4.0
+"""Standard deviations from what the user stated, with an accuracy of their own."""
+
+
+def departed_reasons(departures: Sequence[Departure]) -> list[Reason]:
+    """A reason for every number that has left what was given."""
+    judges = {
+        "distance_m": _distance,
+        "tilt_deg": _tilt,
+        "center_share": _dome,
+        "focal_share": _focal,
+        "principal_point_px": _principal_point,
+        "stretch": _stretch,
+        "unseen_share": _unseen,
+    }
+    found = (judges[item.what](item) for item in departures)
+    return [item for item in found if item is not None]
+
+
+def _numbers(item: Departure) -> dict[str, float]:
+    numbers = {"given": item.given, "estimate": item.estimate, "stddev": item.stddev}
+    return {**numbers, "z": item.z}
+
+
+def _distance(item: Departure) -> Reason | None:
+    """A port distance against the ruler, and against what a housing can be."""
+    far = not math.isfinite(item.stddev)
+    if far:
+        return None
+    unreadable = item.at_least > READABLE_DISTANCE_M > item.given
+    too_long = item.at_least > LONGEST_DISTANCE_M > item.given
+    if item.z < DEPARTED and not too_long:
+        return None
+    times = item.estimate / item.given if item.given > 0.0 else math.inf
+    factor = ""
+    if math.isfinite(times) and times > 1.5:
+        factor = f", {times:.2g} times the given one"
+    source = "the rig file has" if not item.stated else "was stated as"
+    text = (
+        f"Camera {item.camera}: the port came out at {1e3 * item.estimate:.4g} ± "
+        f"{1e3 * item.stddev:.2g} mm{factor} ({source} {1e3 * item.given:.3g} ± "
+        f"{1e3 * item.given_stddev:.2g} mm{'' if item.stated else ', assumed'}); "
+        "measure it with a ruler, and check lens, baseline and units."
+    )
+    severe = unreadable or item.z_at_least >= FAR_DEPARTED
+    severity = DOES_NOT_FIT if severe else DOUBTFUL
+    return reason("port_distance", text, severity, **_numbers(item))
+
+
+def _tilt(item: Departure) -> Reason | None:
+    if not math.isfinite(item.stddev):
+        return None
+    contradicts = item.stated and item.z >= CONTRADICTED
+    if item.at_least < TILTED_DEG and not contradicts:
+        return None
+    text = (
+        f"Camera {item.camera}: the port came out tilted by {item.estimate:.1f} ± "
+        f"{item.stddev:.2g} degrees against the normal given, further than ports are "
+        "mounted; lens, placement of the cameras or kind of port are wrong."
+    )
+    severity = DOES_NOT_FIT if item.at_least >= FAR_TILTED_DEG else DOUBTFUL
+    return reason("port_tilt", text, severity, **_numbers(item))
+
+
+def _dome(item: Departure) -> Reason | None:
+    if not math.isfinite(item.stddev):
+        return None
+    moved = item.at_least > DOME_SHARE > item.given
+    if not moved and not (item.stated and item.z >= CONTRADICTED):
+        return None
+    text = (
+        f"Camera {item.camera}: the centre of the dome came out {item.estimate:.2f} ± "
+        f"{item.stddev:.2g} radii away from the lens; at 1 the lens is in the glass. "
+        "Check the radius, the lens and whether the port is a dome at all."
+    )
+    severity = DOES_NOT_FIT if item.at_least > FAR_DOME_SHARE else DOUBTFUL
+    return reason("dome_centre", text, severity, **_numbers(item))
+
+
+def _focal(item: Departure) -> Reason | None:
+    if item.z < DEPARTED:
+        return None
+    text = (
+        f"Camera {item.camera}: the focal length came out at {item.estimate:.3f} ± "
+        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); check "
+        "that it was calibrated in air, at this resolution and zoom."
+    )
+    severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
+    return reason("focal_length", text, severity, **_numbers(item))
+
+
+def _principal_point(item: Departure) -> Reason | None:
+    if item.z < DEPARTED:
+        return None
+    text = (
+        f"Camera {item.camera}: the principal point moved by {item.estimate:.3g} ± "
+        f"{item.stddev:.2g} px ({_stated(item, '{:.2g} px')}); check that the "
+        "lens was calibrated on images of this crop and orientation."
+    )
+    severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
+    return reason("principal_point", text, severity, **_numbers(item))
+
+
+def _stated(item: Departure, form: str) -> str:
+    word = "stated" if item.stated else "assumed"
+    return f"known to {form.format(item.given_stddev)}, {word}"
+
+
+def _stretch(item: Departure) -> Reason | None:
+    low, high = STRETCH
+    if low <= item.estimate <= high or not low <= item.given <= high:
+        return None
+    text = (
+        f"Camera {item.camera}: the refined distortion moves the edge of the image to "
+        f"{item.estimate:.2g} times its radius, as no lens does."
+    )
+    return reason("distortion", text, DOES_NOT_FIT, **_numbers(item))
+
+
+def _unseen(item: Departure) -> Reason | None:
+    if not item.estimate > item.given:
+        return None
+    text = (
+        f"Camera {item.camera}: the refined distortion folds back within the image; "
+        f"{1e2 * item.estimate:.0f} % of its edge have no ray."
+    )
+    return reason("distortion_folds", text, DOES_NOT_FIT, **_numbers(item))

@@ -1,0 +1,299 @@
+"""Which mistake explains the observations? Every one is undone, and tried.
+
+An adjustment of a few hundred points takes a tenth of a second. A mistake is named
+where a result without it explains the images clearly better, or as well with ports and
+a placement that are near the rig file's, which the result with it has left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from uwsfm._progress import Progress, silent
+from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResult
+from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.rig import Rig
+from uwsfm.scene import Scene
+from uwsfm.solver.threads import limited
+from uwsfm.trust.midway import (
+    coarse_firsts,
+    fine_firsts,
+    shifts_since,
+    zoom_trial,
+)
+from uwsfm.trust.mistakes import Trial, length_trials, trials
+from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
+from uwsfm.trust.verdict import FITS
+
+UNIT = 0.02
+"""A fall of the RMS by so much, relative, counts one; so do the strains below."""
+CLEAR = 1.5
+"""An explanation must be better than the rig as given by so many."""
+TIE = 1.5
+"""Explanations nearer than this to the best cannot be told apart."""
+MAX_TILT_DEG = 15.0
+"""Of a flat port; more is no usual housing."""
+RULER_M, RULER_SHARE = 0.01, 0.5
+"""What a port's distance in a rig file is taken to be known to: a ruler held against a
+housing, to the centre of a lens that nobody sees."""
+AT_ZERO = 2.0
+"""Strain of a port that came out at its lens, which no housing has."""
+MAX_EXPLANATIONS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """A mistake that explains the observations."""
+
+    code: str
+    """See `uwsfm.sfm.correction.CODES`."""
+    text: str
+    """A sentence for people: the mistake, its evidence, and what to change."""
+    rms_before_px: float
+    """Of the best 90 % of the observations, with the rig as given."""
+    rms_after_px: float
+    """With the mistake undone."""
+    gain: float
+    """How much better, in steps of 2 % of the RMS; ports and placement that stay near
+    the rig file's count as well."""
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One trial and what came of it."""
+
+    trial: Trial
+    fit: Fit
+    strain: float
+    """How implausible its numbers are, in steps of 2 % of the RMS."""
+
+    @property
+    def total(self) -> float:
+        return math.log(max(self.fit.rms_px, 1e-9)) / UNIT + self.strain
+
+
+def explain(
+    verdict: str,
+    rig: Rig,
+    calibration: CalibrationResult,
+    frame_names: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> tuple[Explanation, ...]:
+    """`diagnose`, where the verdict on a result is not that it fits.
+
+    Args:
+        verdict: See `uwsfm.trust.verdict`; that a result fits ends the matter.
+        rig: As given.
+        calibration: The result.
+        frame_names: As of `diagnose`.
+        progress: Called with each trial.
+    """
+    if verdict == FITS:
+        return ()
+    scene, _ = calibration.scene.select(calibration.inliers)
+    return diagnose(rig, scene, frame_names, progress, **options_of(calibration))
+
+
+def options_of(calibration: CalibrationResult) -> dict[str, Any]:
+    """What a result was asked to refine and knew, beside its rig file, for `diagnose`.
+
+    Another strategy or error than the joint one on pixels is left out: mistakes show in
+    pixels.
+    """
+    given, plain = calibration.options, CalibrateOptions()
+    pairs = ((name, getattr(given, name)) for name in _KEPT)
+    return {name: value for name, value in pairs if value != getattr(plain, name)}
+
+
+_KEPT = (
+    *PRIORS,
+    "refine_focal",
+    "refine_principal_point",
+    "refine_distortion",
+    "refine_water_index",
+    "separate_water_index",
+)
+
+
+def diagnose(
+    rig: Rig,
+    scene: Scene,
+    frame_names: Sequence[str] | None = None,
+    progress: Progress = silent,
+    **options: Any,
+) -> tuple[Explanation, ...]:
+    """Mistakes that explain the observations, best first; none where the rig fits.
+
+    Args:
+        rig: As given: lenses, initial ports, placement, and what is to be refined.
+        scene: The result with it.
+        frame_names: Of the scene's frames (F), for the words; None: their numbers.
+        progress: Called with each trial.
+        **options: Fields of `CalibrateOptions` that the result was made with.
+    """
+    part, frames = thinned(scene)
+    names = [frame_names[f] if frame_names else f"{f + 1}" for f in frames.tolist()]
+    experiments = _Experiments(options, progress)
+    base = experiments.given(rig, part)
+    todo = [
+        *trials(rig, part.num_frames),
+        *length_trials(rig, base.fit.distances_m()),
+        *shifts_since(rig, part, base.fit, names),
+    ]
+    tried = experiments.all(todo, part)
+    firsts = coarse_firsts(part.num_frames)
+    zoomed = [zoom_trial(rig, first, names[first]) for first in firsts]
+    coarse = experiments.all(zoomed, part)
+    if coarse:
+        best = min(range(len(coarse)), key=lambda k: coarse[k].total)
+        near = fine_firsts(coarse[best].trial.first, part.num_frames)
+        coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
+    tried += _more_than_focal(coarse, tried)
+    if tried:
+        best_fit = min(tried, key=lambda one: one.total).fit
+        base = experiments.again(base, best_fit, part)
+    return explanations(base, tried)
+
+
+def _more_than_focal(zoomed: list[Tried], tried: Sequence[Tried]) -> list[Tried]:
+    """Changes of zoom that explain clearly more than one wrong focal length does."""
+    focal = [one.total for one in tried if one.trial.code == "focal"]
+    limit = min(focal, default=math.inf) - CLEAR
+    return [one for one in zoomed if one.total <= limit]
+
+
+class _Experiments:
+    """Runs trials, and counts them."""
+
+    def __init__(self, options: dict[str, Any], progress: Progress) -> None:
+        self.options = options
+        self.progress = progress
+        self.done = 0
+
+    def tried(self, trial: Trial, part: Scene) -> Tried | None:
+        self.done += 1
+        self.progress("looking for the cause", self.done, None)
+        with limited(1):  # a few hundred points are not worth a second thread
+            fit = trial.fit(part, self.options)
+        if fit is None:
+            return None
+        return Tried(trial, fit, strain_of(trial.rig, fit) + trial.handicap)
+
+    def given(self, rig: Rig, part: Scene) -> Tried:
+        """The rig as given: adjusted anew, or as the result has it."""
+        trial = Trial(code="", what="", remedy="", rig=rig)
+        placement = part.cam_from_rig if rig.cam_from_rig is None else rig.cam_from_rig
+        fit = fit_of(retriangulated_where_lost(part), placement)
+        result = Tried(trial, fit, strain_of(rig, fit))
+        anew = self.tried(trial, part)
+        return result if anew is None or result.total < anew.total else anew
+
+    def again(self, base: Tried, best: Fit, part: Scene) -> Tried:
+        """The rig as given, from the poses of the best trial: from the ones that it
+        bent it may not have come back."""
+        if best.scene.num_frames != part.num_frames:
+            return base
+        poses = replace(
+            part,
+            rig_from_world=best.scene.rig_from_world,
+            cam_from_rig=best.scene.cam_from_rig,
+        )
+        anew = self.tried(base.trial, poses)
+        return base if anew is None or base.total < anew.total else anew
+
+    def all(self, todo: Iterable[Trial], part: Scene) -> list[Tried]:
+        found = (self.tried(trial, part) for trial in todo)
+        return [one for one in found if one is not None]
+
+
+def strain_of(rig: Rig, fit: Fit) -> float:
+    """How far ports and placement are from the rig file's, beyond what is usual."""
+    total = 0.0
+    for item, port in zip(rig.cameras, fit.scene.ports, strict=True):
+        if isinstance(port, FlatPort) and isinstance(item.port, FlatPort):
+            if item.refine_distance:
+                total += _distance_strain(port.distance, item.port.distance)
+            tilt = float(np.degrees(np.arccos(min(port.normal[2], 1.0))))
+            total += _beyond(tilt, MAX_TILT_DEG, 5.0)
+        if isinstance(port, DomePort):
+            offset = float(np.linalg.norm(port.center)) / port.radius
+            total += _beyond(offset, 0.3, 0.1)
+    return total + _beyond(fit.turn_deg, 0.5, 0.5) + _beyond(fit.swing_deg, 1.0, 1.0)
+
+
+def _distance_strain(distance: float, given: float) -> float:
+    """Of a port's distance against the ruler's."""
+    ruler = math.hypot(RULER_M, RULER_SHARE * min(distance, given))
+    at_zero = AT_ZERO if distance < 5e-4 < given else 0.0
+    return _beyond(abs(distance - given) / ruler, 2.0, 1.0) + at_zero
+
+
+def _beyond(value: float, usual: float, step: float) -> float:
+    return min(max(value - usual, 0.0) / step, 8.0)
+
+
+def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]:
+    """Those that are clearly better, best first: one of each kind."""
+    better = [one for one in tried if base.total - one.total >= CLEAR]
+    better.sort(key=lambda one: one.total)
+    chosen: list[Tried] = []
+    for one in better:
+        if one.total - better[0].total > TIE:
+            break
+        if all(one.trial.code != other.trial.code for other in chosen):
+            chosen.append(one)
+    return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
+
+
+def _explained(base: Tried, one: Tried) -> Explanation:
+    before, after = base.fit.rms_px, one.fit.rms_px
+    evidence = [f"{before:.2f} px becomes {after:.2f}"]
+    if before < after * (1.0 + UNIT):
+        evidence = [f"the RMS stays at {after:.2f} px"]
+    evidence += [*_port_evidence(base, one), *_turn_evidence(base, one)]
+    told, remedy = one.trial.estimate(one.fit), one.trial.remedy
+    return Explanation(
+        code=one.trial.code,
+        text=f"Probably {one.trial.what}{told}. Without this mistake "
+        f"{', '.join(evidence)}. {remedy[0].upper()}{remedy[1:]}.",
+        rms_before_px=before,
+        rms_after_px=after,
+        gain=base.total - one.total,
+    )
+
+
+def _port_evidence(base: Tried, one: Tried) -> list[str]:
+    before, after = base.fit.distances_m(), one.fit.distances_m()
+    given = [
+        item.port.distance
+        for item in one.trial.rig.cameras
+        if isinstance(item.port, FlatPort)
+    ]
+    if not before or base.strain < 1.0:
+        return []
+    text = f"ports at {_millimetres(before)}"
+    if after and np.allclose(before, after, rtol=0.1, atol=1e-3):
+        return []
+    if after:
+        text += f" become {_millimetres(after)} (rig file: {_millimetres(given)})"
+        return [text]
+    return [f"{text} are no more needed"]
+
+
+def _turn_evidence(base: Tried, one: Tried) -> list[str]:
+    before, after = base.fit.turn_deg, one.fit.turn_deg
+    if before < 0.5 or after > 0.5 * before:
+        return []
+    return [f"and cam_from_rig turns by {after:.1f} degrees in place of {before:.1f}"]
+
+
+def _millimetres(values: Sequence[float]) -> str:
+    return " and ".join(f"{1e3 * value:.0f}" for value in values) + " mm"

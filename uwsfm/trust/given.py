@@ -1,0 +1,246 @@
+"""Estimates against what was given: ports against the ruler, lenses against their
+calibration.
+
+What is given has an accuracy. Where the user states none, one of those below is
+assumed; they are wide, as most numbers of a rig file are guesses. The deviation of the
+estimate, in all, is added: what is hardly determined contradicts nothing.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens import FISHEYE, NUM_PARAMS
+from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.residuals import border
+from uwsfm.rig import Rig, RigCamera
+from uwsfm.solver.layout import HELD
+
+DISTANCE_SHARE, DISTANCE_M = 0.5, 0.005
+"""Assumed standard deviation of a port distance: half of the smaller of given and
+estimated, 5 mm at least. A guess is often off by a factor of two, a ruler that ends at
+the glass by some millimetres, as nobody sees the lens's projection centre."""
+TILT_DEG = 5.0
+"""Of a normal: ports are mounted straight by eye, and bent or prism-like mounts, of ten
+degrees, are rare."""
+CENTER_SHARE = 0.2
+"""Of the centre of a dome, by its radius: about what a lens can be moved in a dome
+before the image shows it."""
+FOCAL_SHARE = 0.03
+"""Of a focal length that a calibration in air gave and that is refined: focus and
+temperature move it by a per cent."""
+PRINCIPAL_SHARE = 0.02
+"""Of the principal point, by the longer side of the image."""
+EDGE_STEPS = 24
+"""Points along each side of the image at which a lens is looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Departure:
+    """One estimate that has left what was given."""
+
+    camera: str
+    what: str
+    """"distance_m", "tilt_deg", "center_share" (of the dome's radius), "focal_share",
+    "principal_point_px", "stretch" (of the distortion at the image's edge, 1: none),
+    "unseen_share" (of the image's edge, where the lens has no ray)"""
+    given: float
+    estimate: float
+    stddev: float
+    """Of the estimate; NaN: not determined."""
+    given_stddev: float
+    """Stated or, where nothing was stated, assumed; NaN: none is needed."""
+    stated: bool = False
+
+    @property
+    def z(self) -> float:
+        """Difference in standard deviations of both; 0 if it is not determined."""
+        both = math.hypot(self.stddev, self.given_stddev)
+        return abs(self.estimate - self.given) / both if math.isfinite(both) else 0.0
+
+    @property
+    def z_at_least(self) -> float:
+        """Difference less three standard deviations of the estimate, in standard
+        deviations of what was given."""
+        difference = abs(self.estimate - self.given) - 3.0 * self.stddev
+        return difference / self.given_stddev
+
+    @property
+    def at_least(self) -> float:
+        """The estimate, less three of its standard deviations."""
+        return self.estimate - 3.0 * self.stddev
+
+
+def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...]:
+    """Every number that was given and refined; lengths only where they are metres."""
+    found: list[Departure] = []
+    metric = calibration.covariance.scale_stddev is not None
+    for index, camera in enumerate(rig.cameras):
+        refined = calibration.covariance.border_cols[index] != HELD
+        cov = calibration.covariance.judged_cameras[index]
+        after = calibration.scene.cameras[index]
+        found += _port(camera, after.port, cov, refined, calibration, metric)
+        if np.any(refined[border.FIRST_LENS :]):
+            found += _lens(camera, after, index, calibration)
+    return tuple(found)
+
+
+def _port(
+    camera: RigCamera,
+    after: Port,
+    cov: CameraCovariance,
+    refined: Array,
+    calibration: CalibrationResult,
+    metric: bool,
+) -> list[Departure]:
+    before, options, found = camera.port, calibration.options, []
+    # What the rig file says of a number that is refined is no prior, but a claim.
+    distance = options.distance_stddev_m or camera.accuracy.distance_m
+    normal = options.normal_stddev_deg or camera.accuracy.normal_deg
+    stated = options.center_stddev_m or camera.accuracy.center_m
+    if isinstance(before, FlatPort) and isinstance(after, FlatPort):
+        if metric and (refined[border.DISTANCE] or cov.distance_at_zero):
+            smaller = min(before.distance, after.distance)
+            assumed = max(DISTANCE_M, DISTANCE_SHARE * smaller)
+            found.append(
+                Departure(
+                    camera=camera.name,
+                    what="distance_m",
+                    given=before.distance,
+                    estimate=after.distance,
+                    stddev=0.0 if cov.distance_at_zero else cov.distance_stddev_m,
+                    given_stddev=distance or assumed,
+                    stated=distance is not None,
+                )
+            )
+        if np.any(refined[border.NORMAL]):
+            cosine = float(np.dot(before.normal, after.normal))
+            found.append(
+                Departure(
+                    camera=camera.name,
+                    what="tilt_deg",
+                    given=0.0,
+                    estimate=math.degrees(math.acos(min(max(cosine, -1.0), 1.0))),
+                    stddev=cov.normal_stddev_deg,
+                    given_stddev=normal or TILT_DEG,
+                    stated=normal is not None,
+                )
+            )
+    if not (isinstance(before, DomePort) and isinstance(after, DomePort)):
+        return found
+    if np.any(refined[border.CENTER]):
+        found.append(
+            Departure(
+                camera=camera.name,
+                what="center_share",
+                given=float(np.linalg.norm(before.center)) / after.radius,
+                estimate=float(np.linalg.norm(after.center)) / after.radius,
+                stddev=float(np.linalg.norm(cov.center_stddev_m)) / after.radius,
+                given_stddev=(stated or CENTER_SHARE * after.radius) / after.radius,
+                stated=stated is not None,
+            )
+        )
+    return found
+
+
+def _lens(
+    camera: RigCamera,
+    after: RefractiveCamera,
+    index: int,
+    calibration: CalibrationResult,
+) -> list[Departure]:
+    """A refined lens against the one given; a lens without a port is often a guess,
+    whose focal length and centre are compared only where their accuracy is stated."""
+    before = RefractiveCamera(camera.camera, camera.port)
+    options, found = calibration.options, []
+    cols = calibration.covariance.border_cols[index, border.FIRST_LENS :]
+    stddevs = np.append(np.sqrt(np.diag(calibration.covariance.border)), 0.0)[cols]
+    bare = isinstance(camera.port, NoPort)
+    focal, point = options.focal_stddev, options.principal_point_stddev_px
+    if cols[0] != HELD and not (bare and focal is None):
+        found.append(
+            Departure(
+                camera=camera.name,
+                what="focal_share",
+                given=1.0,
+                estimate=float(after.lens[0] / before.lens[0]),
+                stddev=float(stddevs[0] / before.lens[0]),
+                given_stddev=focal or FOCAL_SHARE,
+                stated=focal is not None,
+            )
+        )
+    if cols[2] != HELD and not (bare and point is None):
+        shift = after.lens[2:4] - before.lens[2:4]
+        found.append(
+            Departure(
+                camera=camera.name,
+                what="principal_point_px",
+                given=0.0,
+                estimate=float(np.linalg.norm(shift)),
+                stddev=float(np.linalg.norm(stddevs[2:4])),
+                given_stddev=point or PRINCIPAL_SHARE * max(after.width, after.height),
+                stated=point is not None,
+            )
+        )
+    if np.any(cols[4:NUM_PARAMS] != HELD):
+        found += _distortion(camera, before, after)
+    return found
+
+
+def _distortion(
+    camera: RigCamera, before: RefractiveCamera, after: RefractiveCamera
+) -> list[Departure]:
+    """What a refined distortion does at the edge of the image."""
+    edge = _edge(after, camera.valid_radius_px)
+    stretches, unseen = [], []
+    for item in (before, after):
+        rays = item.with_port(NoPort()).ray_from_img(edge)[1]
+        seen = np.all(np.isfinite(rays), axis=1)
+        offset = (edge - item.lens[2:4]) / item.lens[:2]
+        ideal = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
+        ratio = np.linalg.norm(offset, axis=1) / np.maximum(ideal, 1e-9)
+        far = seen & (ideal > 1e-3)
+        largest = np.argmax(np.abs(np.log(np.where(far, ratio, 1.0))))
+        stretches.append(float(ratio[largest]) if np.any(far) else 1.0)
+        unseen.append(1.0 - float(np.mean(seen)))
+    found = [
+        Departure(
+            camera=camera.name,
+            what="unseen_share",
+            given=unseen[0],
+            estimate=unseen[1],
+            stddev=0.0,
+            given_stddev=math.nan,
+        )
+    ]
+    if after.lens[12] != FISHEYE:  # whose edge is far from a pinhole's, rightly
+        found.append(
+            Departure(
+                camera=camera.name,
+                what="stretch",
+                given=stretches[0],
+                estimate=stretches[1],
+                stddev=0.0,
+                given_stddev=math.nan,
+            )
+        )
+    return found
+
+
+def _edge(camera: RefractiveCamera, valid_radius_px: float | None) -> Array:
+    """Pixels (N, 2) along the edge of the image, or of the part that is valid."""
+    t = np.linspace(0.0, 1.0, EDGE_STEPS)
+    sides = [
+        np.stack([x * np.ones_like(t), y * np.ones_like(t)], axis=1)
+        for x, y in ((t, 0.0), (t, 1.0), (0.0, t), (1.0, t))
+    ]
+    edge = np.concatenate(sides) * [camera.width, camera.height]
+    if valid_radius_px is None:
+        return edge
+    offset = edge - camera.lens[2:4]
+    radius = np.linalg.norm(offset, axis=1, keepdims=True)
+    return camera.lens[2:4] + offset * np.minimum(1.0, valid_radius_px / radius)

@@ -1,0 +1,277 @@
+"""Each mistake that people make, undone: a rig and observations to try.
+
+Those of the rig file alone are in `uwsfm.sfm.rig_mistakes`, where refusals find them;
+here are the others: what is wrong with the images, and numbers that are set free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import FlatPort
+from uwsfm.rig import Rig
+from uwsfm.scene import Scene
+from uwsfm.sfm.correction import Correction
+from uwsfm.sfm.rig_mistakes import (
+    SHIFTS,
+    corrected_pixels,
+    corrections,
+    shift_words,
+)
+from uwsfm.trust.trials import Fit, adjusted
+
+RARER = {"dome_as_flat": 0.3, "water_index": 0.6}
+"""Handicap of what looks like a lens calibrated in the water, and happens less."""
+MIN_FRAMES_LEFT = 2
+"""On each side of a frame from which on something changed."""
+UNITS = {
+    1000.0: "millimetres",
+    100.0: "centimetres",
+    39.37: "inches",
+    3.281: "feet",
+}
+"""A length in metres is so many of them; the factor of a board square is any."""
+SAME_UNIT = 2.0
+"""Ports tell a factor this well: the ruler is no better."""
+MAX_DISTANCE_M = 0.15
+"""Of a usual port."""
+RARE = 6.0
+"""Handicap of a port that no usual housing has."""
+PORT_FACTORS = (10.0, 0.1, 25.4, 1.0 / 25.4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One explanation: a rig, observations, and what may move."""
+
+    code: str
+    what: str
+    """The mistake, a clause."""
+    remedy: str
+    """What to change, an imperative clause."""
+    rig: Rig
+    seen: Callable[[Scene], Scene] = lambda scene: scene
+    """The observations put right, and poses to start from."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Further fields of `CalibrateOptions`."""
+    first: int = 0
+    """The frame from which on something changed."""
+    handicap: float = 0.0
+    """What a trial that frees numbers must be better by: it always fits better."""
+    estimate: Callable[[Fit], str] = lambda fit: ""
+    """What the freed numbers came out as, in words."""
+
+    def fit(self, scene: Scene, options: dict[str, Any]) -> Fit | None:
+        """The rig adjusted to the observations; None where nothing fits."""
+        return adjusted(self.seen(scene), self.rig, **{**options, **self.options})
+
+
+def trials(rig: Rig, num_frames: int) -> Iterator[Trial]:
+    """Every mistake, singly.
+
+    Args:
+        rig: As given.
+        num_frames: Of the observations.
+    """
+    for correction in corrections(rig):
+        yield _of_correction(correction)
+    yield from _free_lenses(rig)
+    yield from shifts(rig, num_frames)
+
+
+def _of_correction(correction: Correction) -> Trial:
+    return Trial(
+        code=correction.code,
+        what=correction.what,
+        remedy=correction.remedy,
+        rig=correction.rig,
+        seen=lambda scene: _corrected(scene, correction),
+        handicap=RARER.get(correction.code, 0.0),
+    )
+
+
+def _corrected(scene: Scene, correction: Correction) -> Scene:
+    if correction.exchanged is False and correction.flipped is None:
+        return scene
+    sizes = np.array([(c.width, c.height) for c in scene.cameras])
+    camera, xy = corrected_pixels(correction, sizes, scene.camera_idx, scene.xy)
+    poses = scene.rig_from_world
+    if correction.exchanged:
+        poses = rigid3.compose(scene.cam_from_rig[1], poses)
+    if correction.flipped is not None:
+        poses = _mirrored(poses, correction.flipped)
+    return replace(scene, camera_idx=camera, xy=xy, rig_from_world=poses)
+
+
+def _mirrored(poses: Array, axis: int) -> Array:
+    """Poses (F, 7) in a world that is mirrored as the images are."""
+    signs = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    signs[axis] = 1.0
+    signs[4 + axis] = -1.0
+    return poses * signs
+
+
+FREE = 1.0
+"""Handicap of two numbers that are set free for each camera."""
+FOCAL = {"refine_focal": True, "focal_stddev": 0.5}
+CENTER = {"refine_principal_point": True, "principal_point_stddev_px": 200.0}
+LENS = {
+    **FOCAL,
+    **CENTER,
+    "refine_distortion": True,
+    "distortion_stddev": 0.5,
+}
+"""Priors that hold nothing but what no image shows."""
+
+
+def _free_lenses(rig: Rig) -> Iterator[Trial]:
+    names = " and ".join(repr(camera.name) for camera in rig.cameras)
+    yield Trial(
+        code="focal",
+        what=f"the focal length of {names} is wrong",
+        remedy="check fx and fy: zoom, focus, video mode and image size must be those "
+        "of the calibration",
+        rig=rig,
+        options=FOCAL,
+        handicap=FREE,
+        estimate=lambda fit: _lens_words(rig, fit, slice(0, 2), "fx, fy"),
+    )
+    yield Trial(
+        code="principal_point",
+        what=f"the principal point of {names} is wrong",
+        remedy="check cx and cy: crop, image size and pixel origin must be those of "
+        "the calibration",
+        rig=rig,
+        options=CENTER,
+        handicap=FREE,
+        estimate=lambda fit: _lens_words(rig, fit, slice(2, 4), "cx, cy"),
+    )
+
+
+def _lens_words(rig: Rig, fit: Fit, part: slice, names: str) -> str:
+    """What two numbers of each lens came out as, and what they were."""
+    words = [
+        f"{', '.join(f'{value:.1f}' for value in new.lens[part])} for "
+        f"{', '.join(f'{value:.1f}' for value in old.lens[part])}"
+        for new, old in zip(fit.scene.cameras, rig.refractive_cameras(), strict=True)
+    ]
+    return f" ({names}: {'; '.join(words)})"
+
+
+def shifts(
+    rig: Rig, num_frames: int, first: int = 0, first_name: str = ""
+) -> Iterator[Trial]:
+    """One camera late or early by some frames, from frame ``first`` on."""
+    since = f" from frame {first_name} on" if first else ""
+    for camera in range(1, len(rig.cameras)):
+        name = rig.cameras[camera].name
+        for shift in SHIFTS:
+            if num_frames - first - abs(shift) < MIN_FRAMES_LEFT:
+                continue
+            what, remedy = shift_words(name, shift, since)
+            yield Trial(
+                code="frames_shifted",
+                what=what,
+                remedy=f"{remedy}; one may be missing",
+                rig=rig,
+                seen=partial(shifted, camera=camera, shift=shift, first=first),
+            )
+
+
+def shifted(scene: Scene, camera: int, shift: int, first: int) -> Scene:
+    """A scene in which the images of one camera belong to other frames."""
+    late = (scene.camera_idx == camera) & (scene.frame_idx >= first)
+    frame = np.where(late, scene.frame_idx + shift, scene.frame_idx)
+    inside = (frame >= 0) & (frame < scene.num_frames)
+    moved = replace(scene, frame_idx=np.clip(frame, 0, scene.num_frames - 1))
+    return moved.select(inside)[0]
+
+
+def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
+    """The baseline or the ports in another unit: points and ports grow with the one.
+
+    Scale is a gauge: no image shows it, and only ports far from the ruler's do.
+
+    Args:
+        rig: As given.
+        distances_m: (C,) where the flat ports of the rig came out.
+    """
+    flat = [c.port for c in rig.cameras if isinstance(c.port, FlatPort)]
+    if rig.cam_from_rig is None or len(rig.cameras) < 2 or not flat or not distances_m:
+        return
+    glass = float(np.mean([port.thickness / port.n_glass for port in flat]))
+    given = float(np.mean([port.distance for port in flat]))
+    # Behind thick glass a port looks as far away as it and its glass are.
+    factor = (float(np.mean(distances_m)) + glass) / (given + glass + 1e-4)
+    assert rig.baseline_m is not None
+    if factor > SAME_UNIT or factor < 1.0 / SAME_UNIT:
+        code, words = _unit_of(factor)
+        yield Trial(
+            code=code,
+            what=f"the baseline is {rig.baseline_m / factor:.2g} m, and not "
+            f"{rig.baseline_m:.3g} m",
+            remedy=f"check the unit of translation_m: {words}",
+            rig=_shorter(rig, factor),
+        )
+    for times in PORT_FACTORS:
+        low, high = (times * port.distance for port in (flat[0], flat[-1]))
+        plausible = min(low, high) > 1e-3 and max(low, high) < MAX_DISTANCE_M
+        yield Trial(
+            code="length_unit",
+            what=f"the port distances are {times:.3g} times those of the rig file",
+            remedy="check the unit of distance_m, which is metres",
+            rig=_with_port_length(rig, "distance", times),
+            handicap=1.0 if plausible else RARE,
+        )
+        yield Trial(
+            code="length_unit",
+            what=f"the glass is {times:.3g} times as thick as in the rig file",
+            remedy="check the unit of thickness_m, which is metres",
+            rig=_with_port_length(rig, "thickness", times),
+            handicap=FREE,
+        )
+
+
+def _unit_of(factor: float) -> tuple[str, str]:
+    """The kind of mistake of a length that is ``factor`` times too long, in words."""
+    if 1.0 / 4.0 < factor < 4.0:
+        return "baseline", f"it is about {factor:.2g} times as long as the ports allow"
+    units = [
+        name
+        for times, name in UNITS.items()
+        if 1.0 / SAME_UNIT < factor / times < SAME_UNIT
+    ]
+    near = f", as in {' or '.join(units)}" if units else ", as in squares of a board"
+    if factor < 1.0:
+        near = ""
+    return "length_unit", (
+        f"by the ports it is about {factor:.2g} times too long{near}"
+        if factor > 1.0
+        else f"by the ports it is about {1.0 / factor:.2g} times too short"
+    )
+
+
+def _shorter(rig: Rig, factor: float) -> Rig:
+    assert rig.cam_from_rig is not None and rig.baseline_m is not None
+    poses = rig.cam_from_rig.copy()
+    poses[:, 4:] /= factor
+    return replace(
+        rig, cam_from_rig=poses, baseline_m=float(np.linalg.norm(poses[1, 4:]))
+    )
+
+
+def _with_port_length(rig: Rig, name: str, times: float) -> Rig:
+    cameras = tuple(
+        replace(item, port=replace(item.port, **{name: times * value}))
+        if (value := getattr(item.port, name, None)) is not None
+        else item
+        for item in rig.cameras
+    )
+    return replace(rig, cameras=cameras)
