@@ -20,7 +20,7 @@ from uwsfm.calibration.scale import scale_slope
 from uwsfm.console import budget_table, housing_table, result_table
 from uwsfm.errors import InputError
 from uwsfm.export.files import SUMMARY
-from uwsfm.pipeline import require_effect
+from uwsfm.job_checks import require_effect
 from uwsfm.report.tables import estimates
 from uwsfm.report.words import deviation
 

@@ -12,7 +12,8 @@ from sfm_scenes import model_of, simulated_dive
 from typer.testing import CliRunner
 
 from uwsfm.batch import Outcome
-from uwsfm.cli import NO_FIT, app
+from uwsfm.cli import app
+from uwsfm.cli_results import NO_FIT
 from uwsfm.console import batch_table
 from uwsfm.export.files import HOUSING, SUMMARY, export_colmap
 from uwsfm.export.verdict_summary import verdict_line, with_verdict

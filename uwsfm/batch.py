@@ -14,7 +14,9 @@ from pathlib import Path
 from uwsfm._progress import Progress, silent
 from uwsfm.dives_file import Dive, load_dives
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.pipeline import checked_rig, output_folder, reconstruct
+from uwsfm.job_checks import checked_rig
+from uwsfm.output_folder import output_folder
+from uwsfm.pipeline import reconstruct
 from uwsfm.sfm.images import find_frames
 from uwsfm.tasks import LOCAL, Workers, require_threads
 from uwsfm.trust.verdict import Word

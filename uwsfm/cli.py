@@ -7,7 +7,7 @@ import io
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -37,13 +37,11 @@ from uwsfm.cli_options import (
     priors_of,
     wanted_of,
 )
+from uwsfm.cli_results import finish, print_housing, print_result
 from uwsfm.cli_simulate import simulate_app
 from uwsfm.cli_surface import clean, color, map_, mesh
 from uwsfm.cli_view import report, view
 from uwsfm.errors import InputError, UwsfmError
-
-if TYPE_CHECKING:
-    from uwsfm.housing_pipeline import HousingResult
 
 app = typer.Typer(
     name="uwsfm",
@@ -65,7 +63,7 @@ app.command("map")(map_)
 app.command()(report)
 app.command()(view)
 
-FAILED, WRONG_INPUT, NO_FIT = 1, 2, 3
+FAILED, WRONG_INPUT = 1, 2
 
 
 def _print_version(wanted: bool) -> None:
@@ -200,8 +198,8 @@ def reconstruct(
             **wanted_of(also or ()),
             **priors_of(prior or ()),
         )
-    _print_result(result.summary)
-    _finish(result.summary, f"results in {out}")
+    print_result(result.summary)
+    finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -290,8 +288,8 @@ def calibrate(
             **wanted_of(refine or ()),
             **priors_of(prior or ()),
         )
-    _print_housing(result)
-    _finish(result.summary, f"results in {out}")
+    print_housing(result)
+    finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -342,8 +340,8 @@ def refine(
             **wanted_of(also or ()),
             **priors_of(prior or ()),
         )
-    _print_result(result.summary)
-    _finish(result.summary, f"results in {out}")
+    print_result(result.summary)
+    finish(result.summary, f"results in {out}")
 
 
 @app.command()
@@ -358,62 +356,10 @@ def demo(
         from uwsfm.demo import run_demo
 
         result, comparison = run_demo(out, mapper, progress)
-    _print_result(result.summary)
+    print_result(result.summary)
     console.print(comparison_table(comparison))
     where = f"results in {out}: open report.html, or points.ply in MeshLab"
-    _finish(result.summary, where)
-
-
-def _finish(summary: dict, where: str) -> None:
-    """The last line, and the exit code of the verdict."""
-    from uwsfm.trust.verdict import DOES_NOT_FIT
-
-    typer.echo(where)
-    if summary["verdict"] == DOES_NOT_FIT:
-        raise typer.Exit(NO_FIT)
-
-
-def _print_result(summary: dict) -> None:
-    from rich.markup import escape
-
-    from uwsfm.console import (
-        FEW_BUDGET_ROWS,
-        budget_table,
-        console,
-        housing_table,
-        print_verdict,
-        result_table,
-        timings_table,
-    )
-
-    print_verdict(summary)
-    console.print(result_table(summary))
-    console.print(housing_table(summary))
-    if len(summary["error_budget"]) > 1:  # something was given that may be wrong
-        console.print(budget_table(summary, FEW_BUDGET_ROWS))
-    for warning in summary["warnings"]:
-        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
-    earlier = summary.get("steps_of_earlier_runs", ())
-    console.print(timings_table(summary["timings_s"], earlier))
-
-
-def _print_housing(result: "HousingResult") -> None:
-    from rich.markup import escape
-
-    from uwsfm.console import (
-        budget_table,
-        calibration_table,
-        console,
-        housing_table,
-        print_verdict,
-    )
-
-    print_verdict(result.summary)
-    console.print(calibration_table(result.summary))
-    console.print(housing_table(result.summary))
-    console.print(budget_table(result.summary))
-    for warning in result.summary["warnings"]:
-        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    finish(result.summary, where)
 
 
 def main() -> None:

@@ -25,17 +25,15 @@ from uwsfm.export.summary import (
     write_json,
 )
 from uwsfm.export.verdict_summary import with_verdict
+from uwsfm.job_checks import checked_rig, require_effect, scene_distance
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.pipeline import (
     WORK,
-    checked_rig,
     compiled,
     housing_warnings,
     locked,
     output_folder,
     refined_rig,
-    require_effect,
-    scene_distance,
     start_scene,
 )
 from uwsfm.rig import Rig

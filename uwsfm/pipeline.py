@@ -14,7 +14,6 @@ from uwsfm.calibration.error_budget import BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
-from uwsfm.errors import InputError
 from uwsfm.export.files import (
     HOUSING,
     POINTS,
@@ -36,6 +35,7 @@ from uwsfm.export.summary import (
 )
 from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.first_run import compile_kernels
+from uwsfm.job_checks import checked_rig, require_effect, scene_distance
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import NoPort
 from uwsfm.output_folder import WORK, locked, output_folder
@@ -43,7 +43,6 @@ from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
 from uwsfm.result_folder import recorded_images, store_calibration
 from uwsfm.rig import Rig
-from uwsfm.rig_file import load_rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colors import stored_point_colors
 from uwsfm.sfm.images import find_frames
@@ -266,39 +265,6 @@ def export_points(model: Model, path: Path, calibration: CalibrationResult) -> N
     export_ply(model, path, calibration.covariance.points, unit=unit)
 
 
-def checked_rig(rig: Rig | str | Path) -> Rig:
-    """A rig, or that of a rig file, whose lenses can be projected."""
-    if not isinstance(rig, Rig):
-        rig = load_rig(rig)
-    for camera, refractive in zip(rig.cameras, rig.refractive_cameras(), strict=True):
-        try:
-            _ = refractive.lens
-        except InputError as error:
-            raise InputError(f"camera {camera.name!r}: {error}") from None
-    return rig
-
-
-def scene_distance(rig: Rig, given_m: float | None) -> float:
-    """How far away the scene of a single camera is, about, metres; 1 if nobody knows.
-
-    Raises:
-        InputError: it is not positive, or the rig has a baseline, which tells.
-    """
-    if given_m is None:
-        return 1.0
-    if len(rig.cameras) > 1:
-        raise InputError(
-            "--scene-distance (scene_distance_m) has no effect: the baseline of the "
-            "rig gives the scale; leave this option out"
-        )
-    if not 0.0 < given_m < np.inf:
-        raise InputError(
-            "--scene-distance (scene_distance_m) must be positive and finite, "
-            f"got {given_m}"
-        )
-    return given_m
-
-
 def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:
     placement = start.cam_from_rig
     if rig.cam_from_rig is not None and not rig.refine_cam_from_rig:
@@ -409,29 +375,3 @@ def refined_rig(rig: Rig, scene: Scene) -> Rig:
     lenses: list[Any] = [camera.camera for camera in scene.cameras]
     pairs = zip(found.cameras, lenses, strict=True)
     return replace(found, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))
-
-
-def require_effect(options: CalibrateOptions) -> None:
-    """Refuse what is known of a number that is not refined."""
-    refined = {
-        "distance_stddev_m": ("the distance of a port", options.refine_distances),
-        "normal_stddev_deg": ("the normal of a port", options.refine_normals),
-        "center_stddev_m": ("the centre of a dome", options.refine_centers),
-        "water_index_stddev": ("the water index", options.refine_water_index),
-        "focal_stddev": ("the focal length", options.refine_focal),
-        "principal_point_stddev_px": (
-            "the principal point",
-            options.refine_principal_point,
-        ),
-        "distortion_stddev": ("the distortion", options.refine_distortion),
-    }
-    for name, (what, wanted) in refined.items():
-        if getattr(options, name) is not None and not np.any(wanted):
-            raise InputError(f"{name} has no effect: {what} is not refined")
-    lens = options.refine_focal, options.refine_principal_point
-    correlated = options.given is not None and options.given.correlated_prior
-    if correlated and not any((*lens, options.refine_distortion)):
-        raise InputError(
-            "accuracy.lens_prior: correlated has no effect: no lens parameter is "
-            "refined; add --refine focal, say, or leave this key out"
-        )

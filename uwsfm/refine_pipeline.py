@@ -32,18 +32,16 @@ from uwsfm.export.summary import (
     versions,
 )
 from uwsfm.export.verdict_summary import with_verdict
+from uwsfm.job_checks import checked_rig, require_effect, scene_distance
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
 from uwsfm.pipeline import (
-    checked_rig,
     compiled,
     export_points,
     housing_warnings,
     locked,
     output_folder,
     refined_rig,
-    require_effect,
-    scene_distance,
 )
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report

@@ -1,0 +1,65 @@
+"""How the results of the jobs are printed, and what they end with."""
+
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from uwsfm.housing_pipeline import HousingResult
+
+NO_FIT = 3
+"""Exit code of a result that does not fit its images; it is written all the same."""
+
+
+def finish(summary: dict[str, Any], where: str) -> None:
+    """The last line, and the exit code of the verdict."""
+    from uwsfm.trust.verdict import DOES_NOT_FIT
+
+    typer.echo(where)
+    if summary["verdict"] == DOES_NOT_FIT:
+        raise typer.Exit(NO_FIT)
+
+
+def print_result(summary: dict[str, Any]) -> None:
+    """Verdict, tables and notes of a reconstruction."""
+    from rich.markup import escape
+
+    from uwsfm.console import (
+        FEW_BUDGET_ROWS,
+        budget_table,
+        console,
+        housing_table,
+        print_verdict,
+        result_table,
+        timings_table,
+    )
+
+    print_verdict(summary)
+    console.print(result_table(summary))
+    console.print(housing_table(summary))
+    if len(summary["error_budget"]) > 1:  # something was given that may be wrong
+        console.print(budget_table(summary, FEW_BUDGET_ROWS))
+    for warning in summary["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
+    earlier = summary.get("steps_of_earlier_runs", ())
+    console.print(timings_table(summary["timings_s"], earlier))
+
+
+def print_housing(result: "HousingResult") -> None:
+    """Verdict, tables and notes of a calibration."""
+    from rich.markup import escape
+
+    from uwsfm.console import (
+        budget_table,
+        calibration_table,
+        console,
+        housing_table,
+        print_verdict,
+    )
+
+    print_verdict(result.summary)
+    console.print(calibration_table(result.summary))
+    console.print(housing_table(result.summary))
+    console.print(budget_table(result.summary))
+    for warning in result.summary["warnings"]:
+        console.print(f"[yellow]note:[/yellow] {escape(warning)}")
