@@ -20,6 +20,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.correction import Correction
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
 from uwsfm.sfm.lens_mistakes import focal_corrections
+from uwsfm.sfm.moved_ports import ports_explain
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
     corrected_pixels,
@@ -144,6 +145,9 @@ def check_rotation(
         pair = max(seen, key=len)
     a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
     found = remedies(rig, cam_from_rig, pair, shifted)
+    # A focal length looks like a port distance: what ports may be is not refused.
+    if set(found) <= {"focal"} and ports_explain(rig, cam_from_rig, pair):
+        return
     if found:
         raise ExplainedInputError(
             f"cameras {a!r} and {b!r} contradict their images: probably "

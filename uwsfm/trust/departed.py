@@ -61,8 +61,9 @@ def _distance(item: Departure) -> Reason | None:
     source = "the rig file has" if not item.stated else "was stated as"
     text = (
         f"Camera {item.camera}: the port came out at {1e3 * item.estimate:.4g} ± "
-        f"{1e3 * item.stddev:.2g} mm{factor} ({source} {1e3 * item.given:.3g} ± "
-        f"{1e3 * item.given_stddev:.2g} mm{'' if item.stated else ', assumed'}); "
+        f"{1e3 * item.stddev:.2g} mm from the images{factor} ({source} "
+        f"{1e3 * item.given:.3g} ± {1e3 * item.given_stddev:.2g} mm"
+        f"{'' if item.stated else ', assumed'}); "
         "measure it with a ruler, and check lens, baseline and units."
     )
     severe = unreadable or item.z_at_least >= FAR_DEPARTED

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import FISHEYE, NUM_PARAMS
 from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
@@ -81,9 +81,8 @@ def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...
     metric = calibration.covariance.scale_stddev is not None
     for index, camera in enumerate(rig.cameras):
         refined = calibration.covariance.border_cols[index] != HELD
-        cov = calibration.covariance.judged_cameras[index]
         after = calibration.scene.cameras[index]
-        found += _port(camera, after.port, cov, refined, calibration, metric)
+        found += _port(camera, after.port, index, refined, calibration, metric)
         if np.any(refined[border.FIRST_LENS :]):
             found += _lens(camera, after, index, calibration)
     return tuple(found)
@@ -92,12 +91,15 @@ def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...
 def _port(
     camera: RigCamera,
     after: Port,
-    cov: CameraCovariance,
+    index: int,
     refined: Array,
     calibration: CalibrationResult,
     metric: bool,
 ) -> list[Departure]:
     before, options, found = camera.port, calibration.options, []
+    cov = calibration.covariance.judged_cameras[index]
+    # The ruler contradicts a lens, too: what the lens is not known to is no excuse.
+    images = calibration.covariance.cameras[index]
     # What the rig file says of a number that is refined is no prior, but a claim.
     distance = options.distance_stddev_m or camera.accuracy.distance_m
     normal = options.normal_stddev_deg or camera.accuracy.normal_deg
@@ -112,7 +114,9 @@ def _port(
                     what="distance_m",
                     given=before.distance,
                     estimate=after.distance,
-                    stddev=math.nan if cov.distance_at_zero else cov.distance_stddev_m,
+                    stddev=(
+                        math.nan if cov.distance_at_zero else images.distance_stddev_m
+                    ),
                     given_stddev=distance or assumed,
                     stated=distance is not None,
                 )
