@@ -67,7 +67,7 @@ def test_self_calibrated_models_end_at_the_refractive_optimum(
     assert_ports(result, dive.truth.ports, sigmas=4.0)
     summary = result.summary
     assert summary["num_registered_frames"] == NUM_FRAMES
-    # Pruning at 3.5 sigma takes 0.7 %; 3600 observations tell the noise to 1.5 %.
+    # Pruning takes some tenths of a per cent; 3600 observations tell noise to 1.5 %.
     assert summary["sigma_px"] == pytest.approx(0.3, rel=0.05)
     assert summary["colmap_model"]["median_error_px"] > 0.3
     # A pinhole's depth is off by some per cent, and with it its baseline.

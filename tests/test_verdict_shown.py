@@ -132,7 +132,7 @@ def test_the_numbers_of_the_summary_are_those_of_the_result(dive_result):
         if item["what"] == "distance_m":
             (camera,) = [c for c in stored["cameras"] if c["name"] == item["camera"]]
             assert item["estimate"] == camera["distance_m"]
-            assert item["stddev"] == camera["distance_stddev_in_all_m"]
+            assert item["stddev"] == camera["distance_stddev_m"]
 
 
 def test_a_doubtful_result_has_weaker_words(dive_result):

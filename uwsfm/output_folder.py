@@ -9,12 +9,20 @@ from filelock import FileLock, Timeout
 
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import CALIBRATION
-from uwsfm.export.files import HOUSING, POINTS, SPARSE, SUMMARY, WORK, read_summary
+from uwsfm.export.files import (
+    HOUSING,
+    POINTS,
+    RIG_GIVEN,
+    SPARSE,
+    SUMMARY,
+    WORK,
+    read_summary,
+)
 from uwsfm.report.files import FOLDER, PAGE
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
 LOCK = "lock"
-RESULTS = (SPARSE, HOUSING, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
+RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
 """What a run writes."""
 
 

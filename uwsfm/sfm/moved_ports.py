@@ -33,7 +33,7 @@ FREEDOM = {
     "center_stddev_m": 0.01,
 }
 """How far ports are from what a person writes down, about."""
-MAX_TILT_DEG = 20.0
+MAX_TILT_DEG = 15.0
 MAX_DISTANCE_M = 0.25
 MAX_MISFIT = 1e-3
 """Radians, median over all matches: half a pixel, noise and wrong matches included."""

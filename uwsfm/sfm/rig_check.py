@@ -36,6 +36,8 @@ MAX_MISFIT = 0.05
 """Radians: about 3 degrees. A port tilted by 8 degrees bends the rays by 2."""
 MAX_TURN_DEG = 5.0
 """A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
+MOST_OF_PORTS_DEG = 7.0
+"""Two ports tilted by 12 degrees in opposite directions; beyond it none is tried."""
 MAX_REST = 5e-3
 """Radians that no turn explains, median: a wrong direction of the baseline."""
 SAME_TURN_DEG = 0.75
@@ -146,7 +148,8 @@ def check_rotation(
     a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
     found = remedies(rig, cam_from_rig, pair, shifted)
     # A focal length looks like a port distance: what ports may be is not refused.
-    if set(found) <= {"focal"} and ports_explain(rig, cam_from_rig, pair):
+    likely = turn <= MOST_OF_PORTS_DEG and set(found) <= {"focal"}
+    if likely and ports_explain(rig, cam_from_rig, pair):
         return
     if found:
         raise ExplainedInputError(
