@@ -16,7 +16,7 @@ from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
@@ -35,6 +35,8 @@ FREEDOM = {
 """How far ports are from what a person writes down, about."""
 MAX_TILT_DEG = 15.0
 MAX_DISTANCE_M = 0.25
+MAX_BEHIND_M = 0.01
+"""A distance may come out below zero, its bound, by what noise does to it."""
 MAX_MISFIT = 1e-3
 """Radians, median over all matches: half a pixel, noise and wrong matches included."""
 LOSS_PX = 3.0
@@ -66,7 +68,12 @@ def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
         options,
         border_priors(scene, settings, columns, 1.0),
     ).state
-    found = state.to_scene(scene)
+    ports = state.ports.copy()
+    behind = (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
+    if np.any(ports[behind, 3] < -MAX_BEHIND_M):
+        return False
+    ports[behind, 3] = 0.0
+    found = replace(state, ports=ports).to_scene(scene)
     if not all(_possible(port) for port in found.ports):
         return False
     step, (first, second) = _step(pair), found.cameras

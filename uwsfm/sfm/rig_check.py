@@ -36,8 +36,9 @@ MAX_MISFIT = 0.05
 """Radians: about 3 degrees. A port tilted by 8 degrees bends the rays by 2."""
 MAX_TURN_DEG = 5.0
 """A relative port tilt of 20 degrees; beyond it the rig itself is wrong."""
-MOST_OF_PORTS_DEG = 7.0
-"""Two ports tilted by 12 degrees in opposite directions; beyond it none is tried."""
+MOST_OF_PORTS, MOST_OF_PORTS_DEG = 0.08, 9.5
+"""Misfit, radians, and turn of two ports tilted by 15 degrees in opposite directions:
+beyond them ports are no explanation."""
 MAX_REST = 5e-3
 """Radians that no turn explains, median: a wrong direction of the baseline."""
 SAME_TURN_DEG = 0.75
@@ -93,6 +94,9 @@ def check_rig(
             continue
         names = rig.cameras[a].name, rig.cameras[b].name
         found = remedies(rig, cam_from_rig, pair, shifted)
+        turned = in_front >= MIN_IN_FRONT and misfit <= MOST_OF_PORTS
+        if turned and _may_be_ports(rig, cam_from_rig, pair, found):
+            continue
         if found:
             evidence = (
                 f"only {in_front:.0%} of the points that both see lie in front of them"
@@ -147,9 +151,7 @@ def check_rotation(
         pair = max(seen, key=len)
     a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
     found = remedies(rig, cam_from_rig, pair, shifted)
-    # A focal length looks like a port distance: what ports may be is not refused.
-    likely = turn <= MOST_OF_PORTS_DEG and set(found) <= {"focal"}
-    if likely and ports_explain(rig, cam_from_rig, pair):
+    if turn <= MOST_OF_PORTS_DEG and _may_be_ports(rig, cam_from_rig, pair, found):
         return
     if found:
         raise ExplainedInputError(
@@ -164,6 +166,15 @@ def check_rotation(
             f"tilted port explains; {POSE_HINT}"
         )
     raise _misfit_error(a, b, rotation.misfit_after)
+
+
+def _may_be_ports(
+    rig: Rig, cam_from_rig: Array, pair: PairMatches, found: Mapping[str, str]
+) -> bool:
+    """Whether the ports explain it as well as what was ``found``: a focal length looks
+    like a port distance, and a frame's motion like a tilt."""
+    similar = set(found) <= {"focal", "frames_shifted"}
+    return similar and ports_explain(rig, cam_from_rig, pair)
 
 
 def fit_of(
