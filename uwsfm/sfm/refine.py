@@ -24,6 +24,10 @@ MIN_ANGLE_DEG = 1.5
 # The start's ports are guesses: an error this large is a wrong match all the same.
 MAX_START_ERROR_PX = 50.0
 
+# Solves after the first: one, as a rule; more while each brings in many observations.
+MAX_ROUNDS = 4
+WORTH_ANOTHER = 1.3
+
 # After the first solve the model is right, and an inlier has the error of a feature.
 MAX_ERROR_PX = 4.0
 
@@ -64,7 +68,8 @@ def refine_scene(
     lengths: Lengths | None = None,
     **options: Any,
 ) -> Refined:
-    """Refractive bundle adjustment, twice: the second with all tracks tested again.
+    """Refractive bundle adjustment, twice: the second with all tracks tested again; and
+    again where the start was so far off that many more agree each time.
 
     Points are triangulated from the water rays before each solve, so that a pinhole's
     points are never kept; observations are tested by their true pixel errors.
@@ -111,27 +116,32 @@ def refine_scene(
         return better_start(found, scene, keep, known.ports, once)
 
     keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
-    first, keep = solve(scene, keep)
-    trusted = np.zeros_like(keep)
-    trusted[np.nonzero(keep)[0][first.inliers]] = True
-    # Points that the start was too far off for get another chance, as a whole.
-    lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
-    trusted |= lost[scene.point_idx] & calibrated
-    scene = retriangulated(_with_result(scene, first), trusted)
-    keep = good_observations(scene, MAX_ERROR_PX) & calibrated
-    check_clicks(given, scene)
-    second, keep = solve(scene, keep)
+    last, keep = solve(scene, keep)
+    solves = last.summary.solves
+    for _ in range(MAX_ROUNDS):
+        num_before = np.count_nonzero(last.inliers)
+        trusted = np.zeros_like(keep)
+        trusted[np.nonzero(keep)[0][last.inliers]] = True
+        # Points that the start was too far off for get another chance, as a whole.
+        lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
+        trusted |= lost[scene.point_idx] & calibrated
+        scene = retriangulated(_with_result(scene, last), trusted)
+        keep = good_observations(scene, MAX_ERROR_PX) & calibrated
+        check_clicks(given, scene)
+        last, keep = solve(scene, keep)
+        solves += last.summary.solves
+        if np.count_nonzero(last.inliers) < WORTH_ANOTHER * num_before:
+            break
     clicks = np.isin(np.nonzero(keep)[0], given.clicked)
-    found = second.inliers & ~clicks
+    found = last.inliers & ~clicks
     kept = np.nonzero(keep)[0][found]
-    final, still = second.scene.select(found)
+    final, still = last.scene.select(found)
     before = start.residuals()[kept]
-    solves = first.summary.solves + second.summary.solves
-    second = replace(second, summary=replace(second.summary, solves=solves))
+    last = replace(last, summary=replace(last.summary, solves=solves))
     return Refined(
         scene=final,
         kept=kept,
-        calibration=_compact(second, final, still, clicks),
+        calibration=_compact(last, final, still, clicks),
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
         num_tested=int(np.count_nonzero(calibrated)),
     )
