@@ -168,6 +168,7 @@ def _mapping() -> None:
     _elimination()
     from uwsfm.sfm.absolute_pose import estimate_rig_pose
     from uwsfm.sfm.options import StartOptions
+    from uwsfm.sfm.relative_pose import estimate_relative_pose
     from uwsfm.sfm.simulated import frames_of, write_features
     from uwsfm.sfm.start import start_from_matches
     from uwsfm.sfm.steps import Steps
@@ -182,6 +183,16 @@ def _mapping() -> None:
         scene.xy[rows],
         scene.points[scene.point_idx[rows]],
     )
+    # Which maps of one camera begin with, and those that are in doubt look for.
+    here, there = (
+        np.flatnonzero((scene.frame_idx == frame) & (scene.camera_idx == 0))
+        for frame in range(2)
+    )
+    _, a, b = np.intersect1d(
+        scene.point_idx[here], scene.point_idx[there], return_indices=True
+    )
+    camera = scene.cameras[0]
+    estimate_relative_pose(camera, camera, scene.xy[here[a]], scene.xy[there[b]])
     with tempfile.TemporaryDirectory() as folder:
         steps = Steps(Path(folder))
         frames = frames_of(rig, scene.num_frames, steps.work_dir)

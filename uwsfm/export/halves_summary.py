@@ -115,11 +115,11 @@ def _split_numbers(split: Split) -> dict[str, Any]:
                 "name": number.name,
                 "group": number.group,
                 "unit": number.unit,
-                "values": list(number.values),
-                "difference": number.difference,
-                "stddev": number.stddev,
-                "stddev_in_all": number.stddev_in_all,
-                "z": number.z,
+                "values": plain(list(number.values)),
+                "difference": plain(number.difference),
+                "stddev": plain(number.stddev),
+                "stddev_in_all": plain(number.stddev_in_all),
+                "z": plain(number.z),
             }
             for number in split.numbers
         ],
@@ -127,8 +127,8 @@ def _split_numbers(split: Split) -> dict[str, Any]:
         "lengths": None if split.lengths is None else vars(split.lengths),
         "projections": {
             "ranges_m": plain(maps.ranges_m),
-            "rms_px": [maps.rms_px(r) for r in ranges],
-            "rms_mm": [maps.rms_mm(r) for r in ranges],
+            "rms_px": plain([maps.rms_px(r) for r in ranges]),
+            "rms_mm": plain([maps.rms_mm(r) for r in ranges]),
             "px": plain(maps.px),
             "mm": plain(maps.mm),
         },

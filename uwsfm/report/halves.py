@@ -20,6 +20,7 @@ def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
         for far, px, mm in zip(
             maps["ranges_m"], maps["rms_px"], maps["rms_mm"], strict=True
         )
+        if None not in (px, mm)  # no pixel of both halves sees so far
     ]
     return {
         "sentences": found["sentences"],
@@ -54,7 +55,12 @@ def halves_payload(summary: dict[str, Any]) -> dict[str, Any]:
 
 def _worse(splits: list[dict[str, Any]]) -> dict[str, Any]:
     """The split that projects farther apart."""
-    return max(splits, key=lambda split: max(split["projections"]["rms_px"]))
+
+    def apart(split: dict[str, Any]) -> float:
+        known = [px for px in split["projections"]["rms_px"] if px is not None]
+        return max(known, default=0.0)
+
+    return max(splits, key=apart)
 
 
 def _middle(maps: dict[str, Any]) -> int:
