@@ -97,7 +97,7 @@ def halves_numbers(found: CrossValidation) -> dict[str, Any]:
         "sentences": halves_sentences(found),
         "enlarged": found.enlarged,
         "unit": found.unit,
-        "splits": [_split_numbers(split) for split in found.splits],
+        "splits": [plain(_split_numbers(split)) for split in found.splits],
         "omitted": list(found.omitted),
     }
 
@@ -115,22 +115,22 @@ def _split_numbers(split: Split) -> dict[str, Any]:
                 "name": number.name,
                 "group": number.group,
                 "unit": number.unit,
-                "values": plain(list(number.values)),
-                "difference": plain(number.difference),
-                "stddev": plain(number.stddev),
-                "stddev_in_all": plain(number.stddev_in_all),
-                "z": plain(number.z),
+                "values": list(number.values),
+                "difference": number.difference,
+                "stddev": number.stddev,
+                "stddev_in_all": number.stddev_in_all,
+                "z": number.z,
             }
             for number in split.numbers
         ],
         "agreements": [vars(agreement) for agreement in split.agreements],
         "lengths": None if split.lengths is None else vars(split.lengths),
         "projections": {
-            "ranges_m": plain(maps.ranges_m),
-            "rms_px": plain([maps.rms_px(r) for r in ranges]),
-            "rms_mm": plain([maps.rms_mm(r) for r in ranges]),
-            "px": plain(maps.px),
-            "mm": plain(maps.mm),
+            "ranges_m": maps.ranges_m,
+            "rms_px": [maps.rms_px(r) for r in ranges],
+            "rms_mm": [maps.rms_mm(r) for r in ranges],
+            "px": maps.px,
+            "mm": maps.mm,
         },
     }
 

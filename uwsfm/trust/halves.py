@@ -239,7 +239,10 @@ def _compared(
         num_observations=(counts[0], counts[1]),
         sigma_px=(first.summary.sigma_px, second.summary.sigma_px),
         numbers=numbers.numbers,
-        agreements=tuple(agreements),
+        # A number at its bound in one half has no prediction there.
+        agreements=tuple(
+            a for a in agreements if np.isfinite([a.ratio, a.p_value]).all()
+        ),
         lengths=None if lengths is None else lengths[0],
         projections=projection_map(
             first.scene, second.scene, scene, rig, with_scale=arbitrary
