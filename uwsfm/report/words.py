@@ -183,7 +183,7 @@ def _source(summary: dict[str, Any]) -> str:
     baseline, stddev = summary["baseline_m"], summary["baseline_stddev_m"]
     sources = []
     if baseline is not None:
-        exact = f"± {1e3 * stddev:.2g} mm" if stddev > 0.0 else "taken as exact"
+        exact = f"± {1e3 * stddev:.2g} mm" if stddev > 0.0 else "held"
         sources.append(f"the baseline of {1e3 * baseline:.5g} mm, {exact}")
     if summary.get("known_lengths"):
         sources.append(f"{len(summary['known_lengths'])} known lengths")
