@@ -9,7 +9,7 @@ from typing import Any
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import RUN_AGAIN
-from uwsfm.export.files import RIG_GIVEN
+from uwsfm.export.files import RIG_GIVEN, SPARSE
 from uwsfm.export.summary import write_json
 from uwsfm.result_folder import open_result
 from uwsfm.rig import Rig
@@ -49,6 +49,11 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
     Raises:
         InputError: the folder is not such a one, or lacks the rig file as given.
     """
+    if (Path(out) / "calibration.json").is_file() and not (Path(out) / SPARSE).is_dir():
+        raise InputError(
+            f"{out} is a result of uwsfm calibrate, which names the cause itself and "
+            "keeps no model: check the result of uwsfm reconstruct or refine"
+        )
     result = open_result(out)
     rig = given_rig(result.folder)
     model, summary = result.model, result.summary

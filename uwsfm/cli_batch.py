@@ -14,7 +14,10 @@ def batch(
     ],
     scheduler: SchedulerOption = "local",
     threads: Annotated[
-        int, typer.Option(min=-1, help="Of all dives together; -1: all cores.")
+        int,
+        typer.Option(
+            min=-1, help="Number of threads of all dives together. -1: all cores."
+        ),
     ] = -1,
 ) -> None:
     """Reconstruct many dives; one that fails never stops the others.

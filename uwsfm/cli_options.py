@@ -53,7 +53,13 @@ MaxFeaturesOption = Annotated[
     ),
 ]
 SeedOption = Annotated[
-    int, typer.Option(min=0, max=2**31 - 1, help="Of all random choices.")
+    int,
+    typer.Option(
+        min=0,
+        max=2**31 - 1,
+        help="Seed of the random number generator. The same seed gives the same "
+        "result.",
+    ),
 ]
 ThreadsOption = Annotated[int, typer.Option(min=-1, help="-1: all cores.")]
 MapperOption = Annotated[
@@ -64,7 +70,8 @@ SceneDistanceOption = Annotated[
     float | None,
     typer.Option(
         metavar="METRES",
-        help="Of one camera's scene, about, as no baseline tells; default: 1.",
+        help="Distance of the scene of a single camera, about. Default: 1. A rig "
+        "measures it.",
         show_default=False,
     ),
 ]

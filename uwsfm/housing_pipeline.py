@@ -268,7 +268,7 @@ class _Job:
             "warnings": [
                 *self._notes(),
                 *notes,
-                *housing_warnings(rig, calibration, budget),
+                *housing_warnings(rig, calibration, budget, verdict.verdict),
             ],
             "error_budget": budget_summary(budget),
             "versions": versions(),

@@ -61,7 +61,7 @@ from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
 from uwsfm.trust.diagnosis import explain
-from uwsfm.trust.verdict import Verdict, refined_verdict
+from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict, refined_verdict
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -219,7 +219,7 @@ class _Job:
         store_calibration(refined.calibration, out)
         timings["colours and export"] = time.perf_counter() - clock
         summary = _summary(model, start, refined, timings, self.images)
-        summary["warnings"] += housing_warnings(model.rig, calibration, budget)
+        summary["warnings"] += housing_warnings(model.rig, calibration, budget, word)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         summary = with_halves(summary, model.rig, calibration)
@@ -347,11 +347,19 @@ def _images_without_points(model: Model) -> list[str]:
 
 
 def housing_warnings(
-    rig: Rig, calibration: CalibrationResult, budget: Sequence[BudgetRow] = ()
+    rig: Rig,
+    calibration: CalibrationResult,
+    budget: Sequence[BudgetRow] = (),
+    verdict: str = FITS,
 ) -> list[str]:
-    """What is not determined of the housings, one sentence each."""
+    """What is not determined of the housings, one sentence each.
+
+    Of a result that does not fit nothing is: more frames would not help it.
+    """
     names = [camera.name for camera in rig.cameras]
-    warnings = list(verdicts(calibration, names, budget))
+    warnings: list[str] = []
+    if verdict != DOES_NOT_FIT:
+        warnings += verdicts(calibration, names, budget)
     bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
     if bare:
         warnings.append(

@@ -258,7 +258,7 @@ class _Job:
         store_calibration(refined.calibration, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
-        summary["warnings"] += housing_warnings(model.rig, calibration, budget)
+        summary["warnings"] += housing_warnings(model.rig, calibration, budget, word)
         summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
         summary = with_halves(summary, model.rig, calibration)

@@ -118,6 +118,12 @@ class Rig:
                 f"baseline_stddev_m: {stddev:g} m should lie between 0 "
                 f"and the baseline, {baseline:g} m"
             )
+        accuracy = self.accuracy.baseline_m
+        if accuracy is not None and not accuracy < baseline:
+            raise InputError(
+                f"accuracy.baseline_m: {accuracy:g} m should be less than the "
+                f"baseline, {baseline:g} m"
+            )
 
     def _check_cameras(self) -> None:
         if not self.cameras:

@@ -12,7 +12,7 @@ ASK_FOR_LENGTH = (
     "give a scale bar, a known distance between two frames, or positions of the frames"
 )
 # A scale better than this is worth printing lengths for.
-DETERMINED_SCALE = 0.05
+DETERMINED_SCALE, OPEN_SCALE = 0.05, 1.0
 WEAK_TURN_DEG, OPEN_TURN_DEG = 2.0, 20.0
 # Standard deviations that a known length may be missed by.
 CONTRADICTION = 4.0
@@ -27,7 +27,7 @@ def scale_verdict(scale_stddev: float | None) -> str:
     """Whether anything determines the scale: a word for people."""
     if scale_stddev is None:
         return ARBITRARY
-    if not math.isfinite(scale_stddev):
+    if not scale_stddev < OPEN_SCALE:
         return "not determined"
     return "determined" if scale_stddev < DETERMINED_SCALE else "weakly determined"
 

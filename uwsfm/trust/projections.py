@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import NoPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 
@@ -70,7 +71,9 @@ def projection_map(
         in_rig.append(rigid3.transform(rig_from_cam, points))
         seen.append(np.broadcast_to(good, points.shape[:2]))
         places.append(np.broadcast_to(xy, (*points.shape[:2], 2)))
-    motion = _best_motion(second, in_rig, places, seen, with_scale)
+    # One central camera sees the same at every size of the scene.
+    sized = len(rig.cameras) > 1 or not isinstance(rig.cameras[0].port, NoPort)
+    motion = _best_motion(second, in_rig, places, seen, with_scale and sized)
     px, mm = [], []
     for c in range(len(first.cameras)):
         moved = _moved(motion, in_rig[c])
