@@ -27,7 +27,7 @@ from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.tracks import match_gaps_px
 from uwsfm.sfm.mapping.triangulation import Views
-from uwsfm.sfm.relative_pose import estimate_relative_pose
+from uwsfm.sfm.relative_pose import MEDIAN_GAP, estimate_relative_pose
 from uwsfm.sfm.relative_pose_options import RelativePoseOptions
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import LevenbergMarquardtOptions, minimize
@@ -41,8 +41,6 @@ MAX_PAIRS = 40
 """Of images, drawn at random: 0.3 s on one core."""
 CUT_STDDEVS = 3.5
 """Matches that miss their own pair's geometry by more are wrong."""
-MEDIAN_GAP = 0.6745
-"""Median of |x| for unit normal x."""
 MAX_GAP_PX = 50.0
 """What a match counts for that the model puts behind a camera."""
 MIN_NOISE_PX = 0.01
