@@ -6,10 +6,11 @@ import logging
 import os
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from uwsfm._progress import Progress, silent
 from uwsfm.dives_file import Dive, load_dives
@@ -41,8 +42,8 @@ class Outcome:
     """True reprojection error."""
     verdict: Word | None = None
     """On the result; None: there is none."""
-    verdict_reason: str | None = None
-    """The first reason why it is not "fits"."""
+    cause: str | None = None
+    """Why it is not "fits": the mistake that explains it, or else the first reason."""
 
 
 def run_batch(
@@ -139,6 +140,8 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
             log.info("verdict: %s", result.verdict.verdict)
             for item in result.verdict.reasons:
                 log.info("%s: %s", item.severity, item.text)
+            for one in result.summary["explanations"]:
+                log.info("cause: %s", one["text"])
             for warning in result.summary["warnings"]:
                 log.info("note: %s", warning)
             log.info("done")
@@ -158,9 +161,14 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
             num_registered_frames=summary["num_registered_frames"],
             rms_px=summary["reprojection_rms_px"]["after"],
             verdict=result.verdict.verdict,
-            verdict_reason=next((r.text for r in result.verdict.reasons), None),
+            cause=_cause(summary),
         )
     return Outcome(name=dive.name, reason=reason, seconds=time.monotonic() - began)
+
+
+def _cause(summary: Mapping[str, Any]) -> str | None:
+    causes = [*summary["explanations"], *summary["reasons"]]
+    return causes[0]["text"] if causes else None
 
 
 class _StepLog:

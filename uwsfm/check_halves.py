@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from uwsfm.calibration.enlarged import enlarged
+from uwsfm.calibration.error_budget import error_budget
+from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import RUN_AGAIN
 from uwsfm.export.files import SUMMARY
-from uwsfm.export.halves_summary import KEY, with_cross_validation
-from uwsfm.export.summary import write_json
+from uwsfm.export.halves_summary import KEY, halves_numbers
+from uwsfm.export.summary import (
+    housing_summary,
+    refined_summary,
+    scale_summary,
+    write_json,
+)
+from uwsfm.export.verdict_summary import reasons_summary, toned
+from uwsfm.judgement import housing_warnings
 from uwsfm.report.files import write_report
 from uwsfm.report.gather import PAGE
-from uwsfm.result_folder import open_result
-from uwsfm.trust.halves import cross_validate
+from uwsfm.result_folder import Result, open_result
+from uwsfm.trust.halves import CrossValidation, cross_validate
+from uwsfm.trust.halves_reason import CODE, halves_reasons
+from uwsfm.trust.verdict import DOES_NOT_FIT, FITS
 
 
 def check_halves(out: str | Path) -> dict[str, Any]:
     """Cross-validate a result of any size.
 
     The summary of the result receives the comparison, and standard deviations that the
-    halves find too small are enlarged there; a report is written again.
+    halves find too small are enlarged in its tables and notes; halves that differ far
+    are a reason of its verdict. A report is written again.
 
     Args:
         out: folder that `reconstruct`, `refine_model` or `run_demo` wrote.
@@ -31,10 +46,53 @@ def check_halves(out: str | Path) -> dict[str, Any]:
         UwsfmError: there are too few frames, or no halves could be adjusted.
     """
     result = open_result(out)
-    found = cross_validate(result.model.rig, result.calibration)
-    summary = with_cross_validation(result.summary, found)
+    if "verdict" not in result.summary:
+        raise InputError(
+            f"{result.folder / SUMMARY} has no verdict: an earlier version of uwsfm "
+            f"made this result; {RUN_AGAIN}"
+        )
+    found = cross_validate(result.model.rig, result.solved)
+    summary = cross_validated(result, found)
     write_json(summary, result.folder / SUMMARY)
     if (result.folder / PAGE).is_file():
         write_report(result.folder)
     numbers: dict[str, Any] = summary[KEY]
     return numbers
+
+
+def cross_validated(result: Result, found: CrossValidation) -> dict[str, Any]:
+    """The summary of a result with a cross-validation, in the place of an earlier one.
+
+    Args:
+        result: as it is stored.
+        found: of its frames.
+    """
+    rig, summary = result.model.rig, result.summary
+    now, budget = enlarged(result.solved, found.enlarged), error_budget(result.solved)
+    judged = {**summary, **_rejudged(summary, found)}
+    # Notes are sentences with numbers in them: those of before go, all others stay.
+    old = housing_warnings(rig, result.calibration, budget, summary["verdict"])
+    new = housing_warnings(rig, now, budget, judged["verdict"])
+    cameras = zip(housing_summary(rig, now), summary["cameras"], strict=True)
+    numbers = {
+        "cameras": [{**fresh, **_of_the_lens(stored)} for fresh, stored in cameras],
+        "refined": refined_summary(rig, now),
+        "scale": scale_summary(now),
+        "warnings": [text for text in summary["warnings"] if text not in old] + new,
+        KEY: halves_numbers(found),
+    }
+    return toned({**judged, **numbers})
+
+
+def _of_the_lens(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """How well a lens was converted, which only its first rig file showed."""
+    return {key: camera[key] for key in camera if key.startswith("lens_conversion")}
+
+
+def _rejudged(summary: Mapping[str, Any], found: CrossValidation) -> dict[str, Any]:
+    """Verdict and reasons of a summary, with what the halves say."""
+    reasons = [reason for reason in summary["reasons"] if reason["code"] != CODE]
+    reasons += reasons_summary(halves_reasons(found))
+    words = [reason["severity"] for reason in reasons]
+    word = DOES_NOT_FIT if DOES_NOT_FIT in words else words[0] if words else FITS
+    return {"verdict": word, "reasons": reasons}

@@ -215,7 +215,10 @@ def calibrate(
     out: ResultsOption,
     strategy: Annotated[
         Literal["joint", "nested"],
-        typer.Option(help="All at once, or the two loops of the 2011 paper."),
+        typer.Option(
+            help="joint: one adjustment of everything. nested: the two nested loops of "
+            "the 2011 paper."
+        ),
     ] = "joint",
     error: Annotated[
         Literal[
@@ -223,15 +226,18 @@ def calibrate(
         ]
         | None,
         typer.Option(
-            help="What is minimised; default: reprojection, nested: virtual_camera.",
+            help="Error that is minimised. Default: reprojection; with --strategy "
+            "nested: virtual_camera.",
             show_default=False,
         ),
     ] = None,
     start: Annotated[
         Literal["virtual", "paper", "pairs"],
         typer.Option(
-            help="Pinholes fitted to the ports; or adjusted as in the paper, with "
-            "1.333 f and radial distortion; or single stereo pairs, for normals only."
+            help="How the adjustment starts. virtual: from pinholes fitted to the "
+            "ports. paper: from pinholes of 1.333 f with radial distortion, adjusted as "
+            "in the paper. pairs: from single stereo pairs, which determine normals "
+            "only."
         ),
     ] = "virtual",
     refine: RefineOption = None,
@@ -255,7 +261,11 @@ def calibrate(
     seed: SeedOption = 0,
     threads: ThreadsOption = -1,
 ) -> None:
-    """Calibrate the ports only: housing.yaml, and what the images tell of it."""
+    """Calibrate the housings only, from images or a COLMAP model, without a cloud.
+
+    Writes housing.yaml with the estimated ports and placement of the cameras, and
+    calibration.json with their standard deviations, the error budget and the verdict.
+    """
     from uwsfm.console import ProgressBars
 
     with ProgressBars() as progress:
@@ -350,7 +360,8 @@ def demo(
     mapper: MapperOption = "refractive",
 ) -> None:
     """Run the main job on the sample that comes with the package."""
-    from uwsfm.console import ProgressBars, comparison_table, console
+    from uwsfm.console import ProgressBars, console
+    from uwsfm.result_tables import comparison_table
 
     with ProgressBars() as progress:
         from uwsfm.demo import run_demo

@@ -24,7 +24,8 @@ def batch(
 
     Run the same command again to go on with those that failed or were stopped.
     """
-    from uwsfm.console import ProgressBars, batch_table, console
+    from uwsfm.console import ProgressBars, console
+    from uwsfm.result_tables import batch_table
 
     with ProgressBars() as progress:
         from uwsfm.batch import run_batch

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from uwsfm.cli_results import finish
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -25,14 +27,18 @@ def check(
         bool,
         typer.Option(
             "--halves",
-            help="Compare disjoint halves of the frames instead, each adjusted alone.",
+            help="Cross-validate instead: adjust disjoint halves of the frames, each "
+            "alone, and compare them. Where they differ by significantly more than "
+            "predicted, the result's standard deviations are enlarged.",
         ),
     ] = False,
 ) -> None:
-    """Look for the mistake that explains a result that does not fit.
+    """Look for the mistake that explains a result, whatever its verdict is.
 
     Each mistake that people make in a rig file or with their images is undone and the
-    result adjusted again: what explains the images clearly better is named.
+    result is adjusted again. A mistake without which the model explains the images
+    clearly better is named, with its evidence and its remedy. The exit code is that of
+    the verdict: 3 if the result does not fit.
     """
     if halves:
         _check_halves(out)
@@ -47,24 +53,27 @@ def check(
     from uwsfm.console import console, print_verdict
     from uwsfm.export.files import read_summary
 
-    print_verdict({**(read_summary(out) or {}), "explanations": ()})
+    summary = read_summary(out) or {}
+    print_verdict({**summary, "explanations": ()})
     if found.explanations:
         console.print(explanations_table(found.explanations))
     else:
         console.print("No mistake explains the images better than the rig as given.")
-    typer.echo(f"written: {out / CHECK}")
+    finish(summary, f"written: {out / CHECK}")
 
 
 def _check_halves(out: Path) -> None:
     from uwsfm.check_halves import check_halves
-    from uwsfm.console import console
-    from uwsfm.export.files import SUMMARY
+    from uwsfm.console import console, print_verdict
+    from uwsfm.export.files import SUMMARY, read_summary
 
     found = check_halves(out)
+    summary = read_summary(out) or {}
+    print_verdict({**summary, "explanations": ()})
     console.print(halves_table(found))
     for sentence in found["sentences"]:
         console.print(sentence, markup=False)
-    typer.echo(f"written: {out / SUMMARY}")
+    finish(summary, f"written: {out / SUMMARY}")
 
 
 def explanations_table(explanations: Iterable[Explanation]) -> Table:
@@ -73,7 +82,7 @@ def explanations_table(explanations: Iterable[Explanation]) -> Table:
     from rich.text import Text
 
     table = Table(
-        title="Error of the best 90 % of the observations, RMS (px)",
+        title="Error (px), RMS of the best 90 % of a sample of the observations",
         title_justify="left",
     )
     table.add_column("mistake", no_wrap=True)
@@ -90,7 +99,7 @@ def halves_table(cross_validation: dict[str, Any]) -> Table:
     """How far the halves of the frames differ, over what they predict."""
     from rich.table import Table
 
-    from uwsfm.export.halves_summary import NAMES
+    from uwsfm.trust.halves_reason import NAMES
 
     table = Table(
         title="Halves of the frames: difference over prediction (1 is right)",

@@ -78,7 +78,8 @@ def _export_las(source: Path, out: Path, suffix: str) -> None:
 
 
 def _export_pinhole(model: Path, out: Path, images: Path | None) -> None:
-    from uwsfm.console import ProgressBars, console, pinhole_table
+    from uwsfm.console import ProgressBars, console
+    from uwsfm.result_tables import pinhole_table
 
     with ProgressBars(NOTHING_WRITTEN) as progress:
         from uwsfm.export.files import read_model

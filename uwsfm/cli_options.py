@@ -70,8 +70,8 @@ SceneDistanceOption = Annotated[
     float | None,
     typer.Option(
         metavar="METRES",
-        help="Distance of the scene of a single camera, about. Default: 1. A rig "
-        "measures it.",
+        help="Rough distance from a single camera to its scene. Default: 1. Not for "
+        "rigs of two or more cameras, which measure it.",
         show_default=False,
     ),
 ]
@@ -79,8 +79,9 @@ SchedulerOption = Annotated[
     str,
     typer.Option(
         metavar="local|tcp://HOST:PORT",
-        help="Who works in parallel: processes here, or the workers of a Dask "
-        "scheduler, which must see all folders under the same paths.",
+        help="Where parallel work is done. local: in processes of this machine. An "
+        "address: by the workers of the Dask scheduler there, on which all folders "
+        "have the same paths as here.",
     ),
 ]
 ReportOption = Annotated[
@@ -131,6 +132,7 @@ def wanted_of(what: Iterable[Refinable]) -> dict[str, bool]:
 def priors_of(texts: Iterable[str]) -> dict[str, float]:
     """KEY=VALUE, as fields of `CalibrateOptions`."""
     from uwsfm.calibration.problem import PRIORS
+    from uwsfm.rig_values import checked_accuracy
 
     found = {}
     for text in texts:
@@ -145,4 +147,8 @@ def priors_of(texts: Iterable[str]) -> dict[str, float]:
             raise InputError(
                 f"--prior {text}: {value!r} is not a number; write KEY=VALUE"
             ) from None
+        try:
+            checked_accuracy(key, found[key])
+        except InputError as error:
+            raise InputError(f"--prior {text}: {error}") from None
     return found

@@ -16,7 +16,7 @@ def finish(summary: dict[str, Any], where: str) -> None:
     from uwsfm.trust.verdict import DOES_NOT_FIT
 
     typer.echo(where)
-    if summary["verdict"] == DOES_NOT_FIT:
+    if summary.get("verdict") == DOES_NOT_FIT:
         raise typer.Exit(NO_FIT)
 
 
@@ -24,12 +24,11 @@ def print_result(summary: dict[str, Any]) -> None:
     """Verdict, tables and notes of a reconstruction."""
     from rich.markup import escape
 
-    from uwsfm.console import (
+    from uwsfm.console import console, print_verdict
+    from uwsfm.result_tables import (
         FEW_BUDGET_ROWS,
         budget_table,
-        console,
         housing_table,
-        print_verdict,
         result_table,
         timings_table,
     )
@@ -49,13 +48,8 @@ def print_housing(result: "HousingResult") -> None:
     """Verdict, tables and notes of a calibration."""
     from rich.markup import escape
 
-    from uwsfm.console import (
-        budget_table,
-        calibration_table,
-        console,
-        housing_table,
-        print_verdict,
-    )
+    from uwsfm.console import console, print_verdict
+    from uwsfm.result_tables import budget_table, calibration_table, housing_table
 
     print_verdict(result.summary)
     console.print(calibration_table(result.summary))

@@ -28,7 +28,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from uwsfm.errors import InputError
 from uwsfm.rig_file import read_yaml
 from uwsfm.rig_problems import first_problem
-from uwsfm.rig_schema import Entry
+from uwsfm.rig_schema import AccuracyEntry, Entry
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[_Number, Field(gt=0)]
@@ -44,7 +44,7 @@ def _one_name(name: str) -> str:
     return name
 
 
-class PriorEntry(Entry):
+class PriorEntry(AccuracyEntry):
     distance_stddev_m: _Positive | None = None
     normal_stddev_deg: _Positive | None = None
     center_stddev_m: _Positive | None = None

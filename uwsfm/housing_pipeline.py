@@ -10,32 +10,30 @@ from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.error_budget import BudgetRow, with_budget
+from uwsfm.calibration.error_budget import BudgetRow
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.errors import InputError
 from uwsfm.export.files import HOUSING, SPARSE
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
-    budget_summary,
     errors_summary,
     housing_summary,
     refined_summary,
     versions,
     write_json,
 )
-from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.judgement import Judgement, judged_result
 from uwsfm.known_lengths import KnownLengths
-from uwsfm.pipeline import (
+from uwsfm.output_folder import (
+    HOUSING_SUMMARY,
     WORK,
-    compiled,
-    housing_warnings,
     locked,
+    made_of_files,
     output_folder,
-    refined_rig,
-    start_scene,
 )
+from uwsfm.pipeline import compiled, refined_rig, start_scene
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import find_model
@@ -49,11 +47,9 @@ from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
-from uwsfm.trust.verdict import Verdict, judged, refined_verdict
+from uwsfm.trust.verdict import Verdict, used_of
 
 Start = Literal["virtual", "paper", "pairs"]
-
-CALIBRATION = "calibration.json"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,6 +102,7 @@ def calibrate_housing(
             or a port distance is asked of single stereo pairs.
         UwsfmError: the images could not be reconstructed; the message says why.
     """
+    made_of = made_of_files(rig, source)
     rig = checked_rig(rig)
     if start not in get_args(Start):
         raise InputError(
@@ -115,7 +112,7 @@ def calibrate_housing(
     # A wrong option fails before anything is written.
     require_effect(CalibrateOptions.parsed(merged))
     known = KnownLengths.read(lengths, positions, lever_arm)
-    source, out = Path(source), output_folder(out)
+    source, out = Path(source), output_folder(out, made_of=made_of)
     if source.suffix == ".npz" and source.is_file():
         raise InputError(
             f"{source} holds arrays, and neither images nor a model: observations are "
@@ -132,7 +129,17 @@ def calibrate_housing(
     if scene_distance_m is not None:
         distance_m = scene_distance(rig, scene_distance_m)
         front_end = replace(front_end, scene_distance_m=distance_m)
-    job = _Job(rig, source, out, start, front_end, known, progress, merged)
+    job = _Job(
+        rig=rig,
+        source=source,
+        out=out,
+        start=start,
+        front_end=front_end,
+        known=known,
+        made_of=made_of,
+        progress=progress,
+        options=merged,
+    )
     _require_front_end_effect(front_end, model=found is not None)
     if found is None:
         frames = find_frames(source, rig, min_num_frames=1)
@@ -170,17 +177,17 @@ class _Job:
     start: Start
     front_end: StartOptions
     known: KnownLengths
+    made_of: dict[str, str | None]
     progress: Progress
     options: Mapping[str, Any]
 
     def run(self, model: ModelStart | None) -> HousingResult:
         compiled(self.front_end.threads, self.progress)
         if self.start == "pairs":
-            calibration, budget = with_budget(self._from_pairs())
+            calibration = self._from_pairs()
             count = calibration.scene.num_frames
             seen = len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
             used = Used(num_frames=count, num_registered=seen)
-            verdict = judged(self.rig, calibration, used)
         else:
             if model is None:
                 scene, names, num_frames = self._from_images()
@@ -196,12 +203,21 @@ class _Job:
             refined = refine_scene(
                 scene, self.rig, self.progress, known=known, **options
             )
-            calibration, budget = with_budget(refined.calibration)
-            refined = replace(refined, calibration=calibration)
-            self.progress("judging the fit", 0, None)
-            verdict = refined_verdict(self.rig, refined, num_frames)
-        notes = () if model is None else model.warnings
-        return self._finish(calibration, budget, verdict, notes)
+            calibration, used = refined.calibration, used_of(refined, num_frames)
+        judged = judged_result(
+            self.rig,
+            calibration,
+            used,
+            self.progress,
+            in_halves=self._reprojects and self.start != "pairs",
+        )
+        return self._finish(judged, () if model is None else model.warnings)
+
+    @property
+    def _reprojects(self) -> bool:
+        """Whether it is the joint adjustment of pixels, which takes little time."""
+        options = CalibrateOptions.parsed(dict(self.options))
+        return options.strategy == "joint" and options.error_name == "reprojection"
 
     def _from_images(self) -> tuple[Scene, Sequence[str], int]:
         """The start, the names of its frames, and how many frames there were."""
@@ -249,13 +265,8 @@ class _Job:
             "distances were taken as given"
         ]
 
-    def _finish(
-        self,
-        calibration: CalibrationResult,
-        budget: tuple[BudgetRow, ...],
-        verdict: Verdict,
-        notes: Sequence[str],
-    ) -> HousingResult:
+    def _finish(self, judged: Judgement, notes: Sequence[str]) -> HousingResult:
+        calibration = judged.calibration
         scene, _ = calibration.scene.select(calibration.inliers)
         rig = refined_rig(self.rig, scene)
         summary = {
@@ -265,28 +276,22 @@ class _Job:
             **errors_summary(calibration),
             "cameras": housing_summary(rig, calibration),
             "refined": refined_summary(rig, calibration),
-            "warnings": [
-                *self._notes(),
-                *notes,
-                *housing_warnings(rig, calibration, budget, verdict.verdict),
-            ],
-            "error_budget": budget_summary(budget),
+            "warnings": [*self._notes(), *notes],
+            "made_of": self.made_of,
             "versions": versions(),
         }
-        summary = with_verdict(verdict, summary)
+        summary = judged.added_to(summary, rig)
         if self.start != "pairs":  # single pairs hold what most mistakes show in
-            causes = explain(
-                verdict.verdict, self.rig, calibration, progress=self.progress
-            )
+            causes = explain(judged.word, self.rig, calibration, progress=self.progress)
             summary["explanations"] = [one.to_json() for one in causes]
-        export_housing(rig, self.out / HOUSING, calibration, verdict=verdict.verdict)
-        write_json(summary, self.out / CALIBRATION)
+        export_housing(rig, self.out / HOUSING, calibration, verdict=judged.word)
+        write_json(summary, self.out / HOUSING_SUMMARY)
         return HousingResult(
             rig=rig,
             calibration=calibration,
-            budget=budget,
+            budget=judged.budget,
             summary=summary,
-            verdict=verdict,
+            verdict=judged.verdict,
         )
 
 

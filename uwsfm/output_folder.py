@@ -1,7 +1,7 @@
 """The output folder of a run: never over what others made, one run at a time."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -19,18 +19,46 @@ from uwsfm.export.files import (
     read_summary,
 )
 from uwsfm.report.files import FOLDER, PAGE
+from uwsfm.result_folder import read_told
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
 LOCK = "lock"
+HOUSING_SUMMARY = "calibration.json"
+"""What `uwsfm calibrate` writes in the place of a model and its summary."""
 RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
 """What a run writes."""
 
 
-def output_folder(out: str | Path, images: str | Path | None = None) -> Path:
-    """Refuse what would overwrite files that are not ours, or mix with the images.
+def made_of_files(rig: object, source: str | Path) -> dict[str, str | None]:
+    """What a result is made of: a run into its folder is the same job again only if it
+    is made of the same.
+
+    Args:
+        rig: path of the rig file; of a rig in memory nothing is known.
+        source: folder of the images, or of the model.
+    """
+    known = isinstance(rig, (str, Path))
+    return {
+        "rig": os.path.realpath(str(rig)) if known else None,
+        "source": os.path.realpath(source),
+    }
+
+
+def output_folder(
+    out: str | Path,
+    images: str | Path | None = None,
+    made_of: Mapping[str, str | None] | None = None,
+) -> Path:
+    """Refuse what would overwrite another dive's result, or files that are not ours, or
+    mix with the images.
+
+    Args:
+        out: the folder.
+        images: of the run.
+        made_of: of the run, see `made_of_files`.
 
     Raises:
-        InputError: a file, the folder of the images, or one with results of others.
+        InputError: a file, the folder of the images, or one with other results.
     """
     out = Path(out)
     if images is not None and os.path.realpath(out) == os.path.realpath(images):
@@ -40,6 +68,7 @@ def output_folder(out: str | Path, images: str | Path | None = None) -> Path:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file, not a folder for results")
     if _made_by_us(out):
+        _require_same_job(out, made_of or {})
         return out
     for name in (*RESULTS, WORK):
         if (out / name).exists():
@@ -47,6 +76,19 @@ def output_folder(out: str | Path, images: str | Path | None = None) -> Path:
                 f"{out / name} exists and was not made by uwsfm: choose another folder"
             )
     return out
+
+
+def _require_same_job(out: Path, made_of: Mapping[str, str | None]) -> None:
+    """Refuse to write over a finished result that is made of something else."""
+    for name in (SUMMARY, HOUSING_SUMMARY):
+        before = read_told(out / name).get("made_of") or {}
+        for key, value in made_of.items():
+            other = before.get(key)
+            if None not in (value, other) and value != other:
+                raise InputError(
+                    f"{out} holds the result of another job, made of {other} and not "
+                    f"of {value}: choose another folder, or delete this one first"
+                )
 
 
 def _made_by_us(out: Path) -> bool:

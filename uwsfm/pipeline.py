@@ -1,7 +1,7 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.error_budget import BudgetRow, with_budget
-from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.export.files import (
@@ -22,10 +20,8 @@ from uwsfm.export.files import (
     export_colmap,
     export_ply,
 )
-from uwsfm.export.halves_summary import with_halves
 from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
-    budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
@@ -33,12 +29,11 @@ from uwsfm.export.summary import (
     scale_summary,
     versions,
 )
-from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.first_run import compile_kernels
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
-from uwsfm.models.port import NoPort
-from uwsfm.output_folder import WORK, locked, output_folder
+from uwsfm.output_folder import WORK, locked, made_of_files, output_folder
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
 from uwsfm.result_folder import recorded_images, store_calibration
@@ -61,7 +56,7 @@ from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
 from uwsfm.trust.diagnosis import explain
-from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict, refined_verdict
+from uwsfm.trust.verdict import Verdict, used_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,9 +136,10 @@ def reconstruct(
         UwsfmError: The images could not be reconstructed; the message says why.
     """
     command = command_line("reconstruct", reconstruct, locals())
-    rig = checked_rig(rig)
+    rig_source, rig = rig, checked_rig(rig)
     require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
-    out = output_folder(out, images)
+    made_of = made_of_files(rig_source, images)
+    out = output_folder(out, images, made_of)
     options = StartOptions(
         features=FeatureOptions(
             clahe=clahe,
@@ -173,6 +169,7 @@ def reconstruct(
             known=known,
             calibration=calibration,
             command=command,
+            made_of=made_of,
             report=report,
             progress=progress,
         )
@@ -190,6 +187,7 @@ class _Job:
     known: KnownLengths
     calibration: Mapping[str, Any]
     command: str | None
+    made_of: dict[str, str | None]
     report: bool
     progress: Progress
 
@@ -203,39 +201,39 @@ class _Job:
         clock = time.perf_counter()
         arrays = start.arrays()
         refined = self._refined(start, arrays)
-        calibration, budget = with_budget(refined.calibration)
-        refined = replace(refined, calibration=calibration)
         timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
-        self.progress("judging the fit", 0, None)
-        verdict = refined_verdict(self.rig, refined, start.summary["num_frames"])
+        used = used_of(refined, start.summary["num_frames"])
+        judged = judged_result(self.rig, refined.calibration, used, self.progress)
         timings["judging the fit"] = time.perf_counter() - clock
-        clock, word = time.perf_counter(), verdict.verdict
+        clock, calibration = time.perf_counter(), judged.calibration
         model = _model(self.rig, arrays, refined, out / WORK)
         export_colmap(model, out / SPARSE)
-        export_housing(model.rig, out / HOUSING, refined.calibration, verdict=word)
+        export_housing(model.rig, out / HOUSING, calibration, verdict=judged.word)
         export_given_rig(self.rig, out / RIG_GIVEN)
-        export_points(model, out / POINTS, refined.calibration)
-        store_calibration(refined.calibration, out)
+        export_points(model, out / POINTS, calibration)
+        store_calibration(judged.solved, out)
         timings["colours and export"] = time.perf_counter() - clock
+        refined = replace(refined, calibration=calibration)
         summary = _summary(model, start, refined, timings, self.images)
-        summary["warnings"] += housing_warnings(model.rig, calibration, budget, word)
-        summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
-        summary = with_halves(summary, model.rig, calibration)
-        summary = with_verdict(verdict, summary)
+        summary["made_of"] = self.made_of
+        summary = judged.added_to(summary, model.rig)
         clock = time.perf_counter()
-        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        causes = explain(
+            judged.word, self.rig, calibration, model.frame_names, self.progress
+        )
         summary["explanations"] = [one.to_json() for one in causes]
         timings["looking for the cause"] = time.perf_counter() - clock
-        found = refined.calibration
-        write_with_report(out, model, found, summary, self.progress, wanted=self.report)
+        write_with_report(
+            out, model, calibration, summary, self.progress, wanted=self.report
+        )
         return ReconstructResult(
             model=model,
-            calibration=refined.calibration,
+            calibration=calibration,
             summary=summary,
             start=arrays,
-            verdict=verdict,
+            verdict=judged.verdict,
         )
 
     def _refined(self, start: Start, arrays: StartArrays) -> Refined:
@@ -344,37 +342,6 @@ def _images_without_points(model: Model) -> list[str]:
     return [
         f"{which}: is the scene in view, and were the images of a frame taken together?"
     ]
-
-
-def housing_warnings(
-    rig: Rig,
-    calibration: CalibrationResult,
-    budget: Sequence[BudgetRow] = (),
-    verdict: str = FITS,
-) -> list[str]:
-    """What is not determined of the housings, one sentence each.
-
-    Of a result that does not fit nothing is: more frames would not help it.
-    """
-    names = [camera.name for camera in rig.cameras]
-    warnings: list[str] = []
-    if verdict != DOES_NOT_FIT:
-        warnings += verdicts(calibration, names, budget)
-    bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
-    if bare:
-        warnings.append(
-            f"the rig file has no port of {', '.join(bare)}: lenses without one were "
-            "taken as calibrated in the water; one that was calibrated in air needs "
-            "its port there"
-        )
-    if calibration.options.error_name == "point_3d":
-        warnings.append(
-            "the error in space is far more sensitive to noise than the reprojection "
-            "error, and biased: its result is for comparison only"
-        )
-    if not calibration.summary.converged:
-        warnings.append("the refractive adjustment stopped before it converged")
-    return warnings
 
 
 def refined_rig(rig: Rig, scene: Scene) -> Rig:

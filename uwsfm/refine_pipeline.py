@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError, UwsfmError
@@ -21,28 +20,20 @@ from uwsfm.export.files import (
     SPARSE,
     export_colmap,
 )
-from uwsfm.export.halves_summary import with_halves
 from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
-    budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
     refined_summary,
     versions,
 )
-from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
-from uwsfm.pipeline import (
-    compiled,
-    export_points,
-    housing_warnings,
-    locked,
-    output_folder,
-    refined_rig,
-)
+from uwsfm.output_folder import locked, made_of_files, output_folder
+from uwsfm.pipeline import compiled, export_points, refined_rig
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
 from uwsfm.result_folder import recorded_images, store_calibration
@@ -65,7 +56,7 @@ from uwsfm.sfm.refine import (
     without_empty_frames,
 )
 from uwsfm.trust.diagnosis import explain
-from uwsfm.trust.verdict import Verdict, refined_verdict
+from uwsfm.trust.verdict import Verdict, used_of
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 """Camera models without distortion: light through a flat port never fits them."""
@@ -141,11 +132,12 @@ def refine_model(
         UwsfmError: too little of the model agrees with the refractive one.
     """
     command = command_line("refine", refine_model, locals())
-    rig = checked_rig(rig)
+    rig_source, rig = rig, checked_rig(rig)
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
     distance_m = scene_distance(rig, scene_distance_m)
-    source, out = Path(source), output_folder(out, images)
+    made_of = made_of_files(rig_source, source)
+    source, out = Path(source), output_folder(out, images, made_of)
     found = _found(source)
     if out.exists() and _same_or_inside(found.folder, out / SPARSE):
         raise InputError(
@@ -166,7 +158,17 @@ def refine_model(
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out):
         job = _Job(
-            rig, start, matches, known, images, out, command, report, progress, timings
+            rig=rig,
+            start=start,
+            database=matches,
+            lengths=known,
+            images=images,
+            out=out,
+            command=command,
+            made_of=made_of,
+            report=report,
+            progress=progress,
+            timings=timings,
         )
         return job.run(options)
 
@@ -223,6 +225,7 @@ class _Job:
     images: Path | None
     out: Path
     command: str | None
+    made_of: dict[str, str | None]
     report: bool
     progress: Progress
     timings: dict[str, float]
@@ -244,27 +247,26 @@ class _Job:
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]
         model, refined = self._model(refined, tracks)
-        calibration, budget = with_budget(refined.calibration)
-        refined = replace(refined, calibration=calibration)
         timing, judging = self.timings, time.perf_counter()
-        self.progress("judging the fit", 0, None)
-        verdict = refined_verdict(self.rig, refined, len(tracks.frame_names))
+        used = used_of(refined, len(tracks.frame_names))
+        judged = judged_result(self.rig, refined.calibration, used, self.progress)
         timing["judging the fit"] = time.perf_counter() - judging
-        clock, word = clock + timing["judging the fit"], verdict.verdict
+        clock, calibration = clock + timing["judging the fit"], judged.calibration
         export_colmap(model, self.out / SPARSE)
-        export_housing(model.rig, self.out / HOUSING, calibration, verdict=word)
+        export_housing(model.rig, self.out / HOUSING, calibration, verdict=judged.word)
         export_given_rig(self.rig, self.out / RIG_GIVEN)
-        export_points(model, self.out / POINTS, refined.calibration)
-        store_calibration(refined.calibration, self.out)
+        export_points(model, self.out / POINTS, calibration)
+        store_calibration(judged.solved, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
+        refined = replace(refined, calibration=calibration)
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
-        summary["warnings"] += housing_warnings(model.rig, calibration, budget, word)
-        summary["error_budget"] = budget_summary(budget)
         summary["command"] = self.command
-        summary = with_halves(summary, model.rig, calibration)
-        summary = with_verdict(verdict, summary)
+        summary["made_of"] = self.made_of
+        summary = judged.added_to(summary, model.rig)
         clock = time.perf_counter()
-        causes = explain(word, self.rig, calibration, model.frame_names, self.progress)
+        causes = explain(
+            judged.word, self.rig, calibration, model.frame_names, self.progress
+        )
         summary["explanations"] = [one.to_json() for one in causes]
         timing["looking for the cause"] = time.perf_counter() - clock
         write_with_report(
@@ -272,11 +274,11 @@ class _Job:
         )
         return RefineResult(
             model=model,
-            calibration=refined.calibration,
+            calibration=calibration,
             summary=summary,
             start=self.start,
             model_idx=model_idx,
-            verdict=verdict,
+            verdict=judged.verdict,
         )
 
     def _refined(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError
@@ -17,6 +18,7 @@ from uwsfm.export.calibration_file import (
     write_calibration,
 )
 from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model, read_summary
+from uwsfm.export.halves_summary import KEY
 
 DENSE_CLOUD = "dense/cloud.ply"
 """Where `uwsfm dense` leaves its cloud."""
@@ -31,7 +33,10 @@ class Result:
     folder: Path
     model: Model
     calibration: CalibrationResult
-    """Of ``model.scene``: every observation there is an inlier."""
+    """Of ``model.scene``: every observation there is an inlier. Its deviations are
+    those of the summary, enlarged where halves of the frames differ."""
+    solved: CalibrationResult
+    """The same, before anything was enlarged."""
     summary: dict[str, Any]
     """summary.json"""
     images: Path | None
@@ -81,11 +86,12 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
             f"{folder / SUMMARY} is missing: the run has not finished; {RUN_AGAIN}"
         )
     mark = fingerprint_of(folder)
-    calibration = read_calibration(folder / CALIBRATION, model.scene, mark)
+    solved = read_calibration(folder / CALIBRATION, model.scene, mark)
     return Result(
         folder=folder,
         model=model,
-        calibration=calibration,
+        calibration=enlarged(solved, summary.get(KEY, {}).get("enlarged", {})),
+        solved=solved,
         summary=summary,
         images=_image_folder(model, images, summary.get("images")),
         fingerprint=mark,

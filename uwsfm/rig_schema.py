@@ -14,6 +14,7 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -32,6 +33,7 @@ from uwsfm.rig import (
     camera_from_radial_undistortion,
 )
 from uwsfm.rig_values import (
+    checked_accuracy,
     checked_baseline,
     checked_center,
     checked_folder,
@@ -249,7 +251,17 @@ _TaggedLens = Annotated[
 _Stddev = Annotated[_Number, Field(ge=0)]
 
 
-class CameraAccuracyEntry(Entry):
+class AccuracyEntry(Entry):
+    """Standard deviations; their keys are those of `ACCURACIES`."""
+
+    @field_validator("*")
+    @classmethod
+    def _has_the_unit(cls, value: Any, info: ValidationInfo) -> Any:
+        checked_accuracy(info.field_name or "", value)
+        return value
+
+
+class CameraAccuracyEntry(AccuracyEntry):
     focal: _Stddev | None = None
     principal_point_px: _Stddev | None = None
     distortion: (
@@ -285,7 +297,7 @@ def _file_or_block(value: Any) -> str:
     return "(file)" if isinstance(value, str) else "(covariance)"
 
 
-class RigAccuracyEntry(Entry):
+class RigAccuracyEntry(AccuracyEntry):
     baseline_m: _Stddev | None = None
     water_index: _Stddev | None = None
     covariance: (

@@ -131,3 +131,38 @@ def checked_folder(value: str) -> str:
     if absolute or ".." in path.parts or not path.parts:
         raise InputError(f"{value!r} must be a folder inside the image directory")
     return str(path)
+
+
+ACCURACIES: dict[str, tuple[float, str]] = {
+    "focal": (0.1, "a share of the focal length: 0.001 is 0.1 %"),
+    "principal_point_px": (500.0, "in pixels"),
+    "thickness_m": (0.02, "in metres: 0.0005 is half a millimetre"),
+    "radius_m": (0.05, "in metres: 0.001 is a millimetre"),
+    "glass_index": (0.3, "in units of the index"),
+    "water_index": (0.1, "in units of the index"),
+    "normal_deg": (45.0, "in degrees"),
+    "distance_m": (0.2, "in metres: 0.002 is two millimetres"),
+    "center_m": (0.1, "in metres: 0.002 is two millimetres"),
+    "rotation_deg": (45.0, "in degrees"),
+    "direction_deg": (45.0, "in degrees"),
+    "baseline_m": (1.0, "in metres: 0.001 is a millimetre"),
+}
+"""Accuracies that a person may state: what each stays below, and its unit. Per cent,
+pixels or millimetres in the place of that unit lie beyond. Distortion coefficients have
+no common size: `uwsfm.calibration.given_accuracy` asks how far they move the corner."""
+
+
+def checked_accuracy(key: str, value: object) -> None:
+    """Refuse a standard deviation that must be in another unit.
+
+    Args:
+        key: of a rig file's "accuracy", or of a prior ("focal_stddev" is "focal").
+        value: anything but a number passes.
+    """
+    most, unit = ACCURACIES.get(key.replace("_stddev", ""), (math.inf, ""))
+    if not isinstance(value, float) or value < most or IMPLAUSIBLE_ALLOWED.get():
+        return
+    raise InputError(
+        f"{value:g} is no plausible standard deviation; it is given {unit}, and must "
+        f"be less than {most:g}"
+    )

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from uwsfm.calibration.error_budget import with_budget
-from uwsfm.pipeline import refined_verdict
 from uwsfm.rig import Rig
 from uwsfm.sfm.refine import Refined
 from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.verdict import judged, used_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ def assessed(
         frame_names: Of those that are.
         diagnosed: False: look for no cause, which takes some seconds.
     """
-    verdict = refined_verdict(rig, refined, num_frames)
+    verdict = judged(rig, refined.calibration, used_of(refined, num_frames))
     reasons = [f"{reason.code}: {reason.text}" for reason in verdict.reasons]
     causes: tuple[str, ...] = ()
     if diagnosed:

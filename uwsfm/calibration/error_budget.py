@@ -66,7 +66,9 @@ class BudgetRow:
     scale: float
     """Relative change of all lengths."""
     share: float
-    """Largest shift, in standard deviations in all: what rows are sorted by."""
+    """Largest shift of a port or of the scale, which tables show, in standard
+    deviations in all: what rows are sorted by. Where none of them is estimated: of
+    anything."""
 
 
 def error_budget(
@@ -109,6 +111,10 @@ class _Sheet:
         self.reach = reach
         covariance = calibration.covariance
         self.refined = covariance.border_cols != HELD
+        of_ports = np.zeros_like(self.refined)
+        of_ports[:, border.NORMAL.start : border.CENTER.stop] = True
+        shown = self.refined & of_ports
+        self.shown = shown if shown.any() else self.refined
         self.steps = np.where(self.refined[..., None], reach.border_steps, 0.0)
         columns = covariance.border_cols
         own = np.append(np.diag(covariance.border), 0.0)[columns]
@@ -147,7 +153,7 @@ class _Sheet:
         step = self.steps @ changes
         scale = float(self.reach.scale_step @ changes)
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.abs(step)[self.refined] / self.stddevs[self.refined]
+            shares = np.abs(step)[self.shown] / self.stddevs[self.shown]
         share = float(np.max(shares, initial=0.0))
         if self.has_scale and self.scale_stddev > 0.0:
             share = max(share, abs(scale) / float(self.scale_stddev))

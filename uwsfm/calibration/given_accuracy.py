@@ -12,7 +12,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwsfm.calibration.named_covariance import NamedCovariance, steps_of_names
+from uwsfm.calibration.named_covariance import (
+    NamedCovariance,
+    require_stated_once,
+    steps_of_names,
+)
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
@@ -24,6 +28,8 @@ PRINCIPAL_POINT_PX = 1.0
 CORNER = 0.005
 """How far each radial coefficient alone may move the image corner, as a share of its
 distance from the centre: 0.01 of k1 for a lens whose corners are 35 degrees off."""
+MAX_CORNER = 0.3
+"""Of a standard deviation that a person states: coefficients move no corner so far."""
 TANGENTIAL = 1e-3
 NEXT_COEFFICIENT = -0.9
 """Correlation of k1 with k2, k2 with k3 ... if they are not given as a covariance, for
@@ -94,7 +100,8 @@ class RigAccuracy:
     """Of a baseline that is held."""
     water_index: float | None = None
     covariance: NamedCovariance | None = None
-    """Replaces the single deviations of the parameters that it names."""
+    """In the place of the defaults of the parameters that it names. Their assumed
+    correlations with parameters that it does not name end, too."""
     lens_prior: Literal["independent", "correlated"] = "independent"
     """"correlated": lens parameters that are refined have the covariance as a prior."""
     exact: bool = False
@@ -157,6 +164,8 @@ def given_accuracy(
         InputError: the covariance names what the rig does not have.
     """
     names = tuple(camera.name for camera in cameras)
+    if rig.covariance is not None:
+        require_stated_once(cameras, rig.baseline_m, rig.covariance)
     if rig.exact:
         cameras = [replace(c, accuracy=_otherwise_exact(c)) for c in cameras]
         rig = replace(
@@ -237,6 +246,13 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
         if slot in powers:
             default = CORNER / corner ** powers[slot]
         value = None if given is None else given[k]
+        moved = (value or 0.0) * corner ** powers.get(slot, 2)
+        if moved > MAX_CORNER:
+            raise InputError(
+                f"camera {camera.name!r}: accuracy.distortion[{k}] is {value:g}, which "
+                f"would move the image corner by {1e2 * moved:.0f} % of its distance "
+                "from the centre; it is one standard deviation of the coefficient"
+            )
         _set(stddevs, assumed, first + slot, value, default)
 
 
@@ -323,12 +339,6 @@ def _replace_named(
     assert named is not None
     onto = steps_of_names(cameras, named.names)
     touched = np.flatnonzero(np.any(onto != 0.0, axis=1))
-    lengths = touched % border.BORDER_SIZE == border.LENGTH
-    if rig.baseline_m is not None and np.any(lengths):
-        raise InputError(
-            "accuracy: the covariance holds the translation, and so the baseline: "
-            "leave baseline_m out"
-        )
     covariance[touched] = 0.0
     covariance[:, touched] = 0.0
     covariance += onto @ named.matrix @ onto.T

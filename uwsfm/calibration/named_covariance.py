@@ -55,6 +55,61 @@ class NamedCovariance:
         object.__setattr__(self, "matrix", 0.5 * (matrix + matrix.T))
 
 
+def without_names(named: NamedCovariance, prefix: str) -> NamedCovariance | None:
+    """The covariance of the other parameters; None if there are none.
+
+    Args:
+        named: a covariance.
+        prefix: with which the names begin that are left out.
+    """
+    rows = [k for k, name in enumerate(named.names) if not name.startswith(prefix)]
+    if not rows:
+        return None
+    return NamedCovariance(
+        names=tuple(named.names[k] for k in rows),
+        matrix=named.matrix[np.ix_(rows, rows)],
+    )
+
+
+def require_stated_once(
+    cameras: Sequence["GivenCamera"], baseline_m: float | None, named: NamedCovariance
+) -> None:
+    """Refuse an accuracy that is stated singly and in a covariance.
+
+    Args:
+        cameras: in the rig's order, with the accuracies that a person stated.
+        baseline_m: stated accuracy of the baseline.
+        named: the covariance.
+
+    Raises:
+        InputError: one of the two has to go.
+    """
+    onto = steps_of_names(cameras, named.names)
+    touched = np.any(onto != 0.0, axis=1).reshape(len(cameras), border.BORDER_SIZE)
+    for c, camera in enumerate(cameras):
+        for key, slots in _STATED.items():
+            if getattr(camera.accuracy, key) is not None and touched[c, slots].any():
+                raise InputError(
+                    f"camera {camera.name!r}: accuracy.{key} and accuracy.covariance "
+                    "state the accuracy of the same numbers: leave one of them out"
+                )
+    if baseline_m is not None and touched[:, border.LENGTH].any():
+        raise InputError(
+            "accuracy: the covariance holds the translation, and so the baseline: "
+            "leave baseline_m out"
+        )
+
+
+_STATED = {
+    "focal": slice(border.FIRST_LENS, border.FIRST_LENS + 2),
+    "principal_point_px": slice(border.FIRST_LENS + 2, border.FIRST_LENS + 4),
+    "distortion": slice(border.FIRST_LENS + 4, border.LENS.stop),
+    "rotation_deg": border.ROTATION,
+    "direction_deg": border.DIRECTION,
+}
+"""Accuracies that a covariance may hold as well, and their slots."""
+
+
 def steps_of_names(cameras: Sequence["GivenCamera"], names: tuple[str, ...]) -> Array:
     """Derivative (C BORDER_SIZE, K) of the border's steps by named parameters.
 

@@ -209,22 +209,21 @@ def _distances(
         word = _verdict(stddev, WEAK_SHARE * typical, typical)
         if word == "determined":
             continue
-        what = _direction(vector, [names[int(c)] for c in free])
-        verb = "are" if what.startswith("the distances") else "is"
+        what, each = _direction(vector, [names[int(c)] for c in free])
         camera = int(free[int(np.argmax(np.abs(vector)))])
         own = _verdict(
             covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * typical, typical
         )
         cause = causes.given(own, lambda shift: abs(shift.distance_m), camera)
-        known = f"{1e3 * stddev:.1f} {unit}"
+        known = f"{1e3 * stddev:.1f} {unit}{each}"
         if cause is not None:
             sentences.append(
-                f"{what} {verb} {word}: standard deviation {known} in all; {cause}"
+                f"{what} {word}: standard deviation {known} in all; {cause}"
             )
             continue
         reason, advice = geometry.reason()
         sentences.append(
-            f"{what} {verb} {word} by {reason}: standard deviation {known}; {advice}"
+            f"{what} {word} by {reason}: standard deviation {known}; {advice}"
         )
     return sentences
 
@@ -233,17 +232,17 @@ def _strong(vector: Array) -> NDArray[np.bool_]:
     return np.abs(vector) > 0.5 * np.abs(vector).max()
 
 
-def _direction(vector: Array, names: list[str]) -> str:
-    """What a direction in the space of distances is called."""
+def _direction(vector: Array, names: list[str]) -> tuple[str, str]:
+    """What a direction in the space of distances is called, with its verb; and "each"
+    if its deviation is that of several."""
     strong = _strong(vector)
-    if np.count_nonzero(strong) == 1:
-        return f"the distance of the port of {names[int(np.argmax(np.abs(vector)))]}"
     some = [name for name, on in zip(names, strong, strict=True) if on]
-    which = "both ports" if len(names) == 2 else f"the ports of {', '.join(some)}"
-    if len(some) == len(names) > 2:
-        which = "all ports"
+    if len(some) == 1:
+        return f"the port distance of {some[0]} is", ""
     same = np.all(vector[strong] > 0.0) or np.all(vector[strong] < 0.0)
-    return f"the common distance of {which}" if same else f"the distances of {which}"
+    how = "together" if same else "against each other"
+    which = f"{', '.join(some[:-1])} and {some[-1]}"
+    return f"the port distances of {which}, moved {how}, are", " each"
 
 
 def _tilts(

@@ -1,6 +1,6 @@
 """What a calibration is asked to do, and what it reports."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -332,6 +332,9 @@ class Covariance:
     in_all: InAll | None = None
     """With the errors of what was given, see `uwsfm.calibration.given_errors`; all of
     the above is from the images and priors alone."""
+    enlarged: Mapping[str, float] = field(default_factory=dict)
+    """Groups of numbers whose deviations halves of the frames found too small, and by
+    which factor they were multiplied, see `uwsfm.calibration.enlarged`."""
 
     @property
     def judged_cameras(self) -> tuple[CameraCovariance, ...]:

@@ -61,6 +61,28 @@ def paper_tilt(calibration: CalibrationResult, camera: int) -> PaperTilt:
     )
 
 
+def slope_stddevs_deg(
+    calibration: CalibrationResult, camera: int
+) -> tuple[list[float | None], list[float | None]]:
+    """Standard deviations of asin(n_x) and asin(n_y), degrees: from the images, and in
+    all. Together they make the angle of `CameraCovariance.normal_stddev_deg`, of which
+    each alone is about 1 / sqrt(2). None: held, or not determined.
+
+    Args:
+        calibration: with its covariance.
+        camera: index of a camera behind a flat port.
+    """
+    port = calibration.scene.ports[camera]
+    assert isinstance(port, FlatPort)
+    level = np.sqrt(1.0 - np.square(port.normal[:2]))
+    slopes = unit_vector.tangent_basis(port.normal)[:2] / level[:, None]
+    own, in_all = (
+        [_degrees(slope @ block @ slope) for slope in slopes]
+        for block in _blocks(calibration, camera)
+    )
+    return own, in_all
+
+
 def _blocks(calibration: CalibrationResult, camera: int) -> tuple[Array, Array]:
     """(2, 2) of the normal's tangents, from the images and in all."""
     covariance = calibration.covariance

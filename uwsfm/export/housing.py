@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from uwsfm.calibration.length_verdicts import small_unit
+from uwsfm.calibration.named_covariance import without_names
 from uwsfm.calibration.observability import center_verdict, distance_verdict
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.export.verdict_summary import shown_word
@@ -63,7 +64,7 @@ def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
     """The rig with what is known of its estimates, for whoever holds them next."""
     known = calibration.covariance.judged_cameras
     turned = calibration.options.refine_cam_from_rig
-    cameras = []
+    cameras, covariance = [], rig.accuracy.covariance
     for c, (camera, cov) in enumerate(zip(rig.cameras, known, strict=True)):
         found: dict[str, Any] = {}
         if camera.refine_normal:
@@ -74,13 +75,16 @@ def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
             found["center_m"] = math.hypot(*cov.center_stddev_m) / math.sqrt(3.0)
         if c > 0 and turned:
             found["rotation_deg"] = cov.rotation_stddev_deg / math.sqrt(3.0)
+            if covariance is not None:  # which was of the rotation before
+                covariance = without_names(covariance, f"{camera.name}.rotation_")
         digits: dict[str, Any] = {
             key: float(f"{value:.4g}")
             for key, value in found.items()
             if math.isfinite(value)
         }
         cameras.append(replace(camera, accuracy=replace(camera.accuracy, **digits)))
-    return replace(rig, cameras=tuple(cameras))
+    accuracy = replace(rig.accuracy, covariance=covariance)
+    return replace(rig, cameras=tuple(cameras), accuracy=accuracy)
 
 
 def export_given_rig(rig: Rig, path: str | Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm._files import replaced_file
+from uwsfm.calibration.enlarged import column_factors
 from uwsfm.calibration.error_budget import BudgetRow
 from uwsfm.calibration.length_verdicts import scale_verdict, small_unit
 from uwsfm.calibration.lengths import LengthFit, PositionFit
@@ -22,7 +23,7 @@ from uwsfm.calibration.observability import (
 )
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.calibration.reopened import reopened
-from uwsfm.calibration.tilt import paper_tilt
+from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.models.lens import param_slots
 from uwsfm.models.port import DomePort, FlatPort, NoPort
@@ -91,8 +92,11 @@ def _port_summary(
     if isinstance(port, DomePort):
         place = _dome_summary(camera, port, cov, in_all)
     else:
+        own, total = slope_stddevs_deg(calibration, index)
         place = {
             **_flat_summary(camera, port, cov, in_all),
+            "tilt_xy_stddev_deg": own,
+            "tilt_xy_stddev_in_all_deg": total,
             **asdict(paper_tilt(calibration, index)),
         }
     return {
@@ -222,7 +226,8 @@ def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, 
     if not _refines_more(calibration):
         return []
     # As of ports: what neighbouring features share is in it.
-    variances = np.diag(border_covariance(reopened(calibration)))
+    grow = column_factors(covariance, scene.ports, covariance.enlarged)
+    variances = grow**2 * np.diag(border_covariance(reopened(calibration)))
     stddevs = in_all = np.sqrt(np.append(variances, np.nan))
     if covariance.in_all is not None:
         added = np.diag(covariance.in_all.border) - np.diag(covariance.border)
@@ -265,15 +270,23 @@ def _refines_more(calibration: CalibrationResult) -> bool:
     return bool(np.any(calibration.covariance.border_cols[:, slots] != HELD))
 
 
-def budget_summary(rows: Sequence[BudgetRow]) -> list[dict[str, Any]]:
+def budget_summary(
+    rows: Sequence[BudgetRow], scale_stddev: float | None
+) -> list[dict[str, Any]]:
     """What one standard deviation of each given number would do, the largest first and
-    all together last; null if that is not determined."""
+    all together last; null if that is not determined.
+
+    Args:
+        rows: of `uwsfm.calibration.error_budget`.
+        scale_stddev: of the same result's covariance; None: its scale is arbitrary,
+            and lengths without a unit have no error.
+    """
     return [
         {
             "if": row.name,
             "amount": row.amount,
             "deviation": _source(row),
-            "scale": _stddev(row.scale, True),
+            "scale": _stddev(row.scale, scale_stddev is not None),
             "cameras": [
                 {
                     "tilt_deg": _stddev(shift.tilt_deg, True),

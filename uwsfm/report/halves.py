@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.export.halves_summary import KEY, NAMES
+from uwsfm.export.halves_summary import KEY
+from uwsfm.trust.halves_reason import NAMES
 
 
 def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
@@ -12,17 +13,7 @@ def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
     found = summary.get(KEY)
     if not found or not found.get("splits"):
         return None
-    worse = _worse(found["splits"])
-    maps, unit = worse["projections"], found["unit"]
-    small = "mm" if unit == "m" else "thousandths of a unit"
-    others = [
-        f"{px:.2g} px, {mm:.2g} {small} at {far:.2g} {unit}"
-        for far, px, mm in zip(
-            maps["ranges_m"], maps["rms_px"], maps["rms_mm"], strict=True
-        )
-        if None not in (px, mm)  # no pixel of both halves sees so far
-    ]
-    return {
+    rows = {
         "sentences": found["sentences"],
         "rows": [
             {
@@ -34,6 +25,21 @@ def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
             for split in found["splits"]
             for row in split["agreements"]
         ],
+    }
+    if not _estimated(found):
+        return {**rows, "split": None}
+    worse = _worse(found["splits"])
+    maps, unit = worse["projections"], found["unit"]
+    small = "mm" if unit == "m" else "thousandths of a unit"
+    others = [
+        f"{px:.2g} px, {mm:.2g} {small} at {far:.2g} {unit}"
+        for far, px, mm in zip(
+            maps["ranges_m"], maps["rms_px"], maps["rms_mm"], strict=True
+        )
+        if None not in (px, mm)  # no pixel of both halves sees so far
+    ]
+    return {
+        **rows,
         "split": worse["name"],
         "range": f"{maps['ranges_m'][_middle(maps)]:.2g} {unit}",
         "ranges": f"RMS over all cameras: {'; '.join(others)}.",
@@ -43,7 +49,7 @@ def halves_of(summary: dict[str, Any]) -> dict[str, Any] | None:
 def halves_payload(summary: dict[str, Any]) -> dict[str, Any]:
     """What the script draws: a map (rows, columns) per camera, and its darkest, px."""
     found = summary.get(KEY)
-    if not found or not found.get("splits"):
+    if not found or not found.get("splits") or not _estimated(found):
         return {}
     maps = _worse(found["splits"])["projections"]
     middle = [camera[_middle(maps)] for camera in maps["px"]]
@@ -51,6 +57,11 @@ def halves_payload(summary: dict[str, Any]) -> dict[str, Any]:
     known = values[np.isfinite(values)]
     largest = float(np.percentile(known, 95.0)) if len(known) else 1.0
     return {"halves": middle, "halves_limit": max(largest, 1e-3)}
+
+
+def _estimated(found: dict[str, Any]) -> bool:
+    """Whether anything is that halves could project differently by."""
+    return any(split["numbers"] for split in found["splits"])
 
 
 def _worse(splits: list[dict[str, Any]]) -> dict[str, Any]:

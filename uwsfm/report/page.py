@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from uwsfm.export.verdict_summary import plain
 from uwsfm.report.gather import Report
 from uwsfm.report.halves import halves_of, halves_payload
-from uwsfm.report.tables import budget_columns, budget_lines
+from uwsfm.report.tables import budget_columns, budget_lines, lengths_note
 from uwsfm.report.words import deviation, known_length_rows, position_words
 from uwsfm.trust.residuals import FEWEST, CameraResiduals, Profile, Residuals
 from uwsfm.trust.verdict import LENS_SHARE
@@ -73,6 +73,7 @@ def page_of(report: Report) -> str:
         known_lengths=known_length_rows(summary),
         budget=budget_lines(summary),
         budget_columns=budget_columns(summary),
+        lengths_note=lengths_note(summary),
         positions=position_words(summary),
         view_caption=_view_caption(report),
         residual_words=[_residual_words(camera) for camera in report.residuals],

@@ -16,7 +16,8 @@ from uwsfm.report.words import (
     deviation,
     rounded,
     small_lengths,
-    tilts_deg,
+    tilts_of,
+    unit_of,
 )
 from uwsfm.scene import IndexArray
 
@@ -87,10 +88,9 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
         rows.append(_given(group, "dome radius", 1e3 * camera["radius_m"], "mm"))
     else:
         word = camera["normal_verdict"]
-        tilt = camera["normal_stddev_deg"], camera["normal_stddev_in_all_deg"]
         rows = [
-            _number(group, f"port tilt {axis}", value, tilt, ("deg", 1.0), word)
-            for axis, value in zip("xy", tilts_deg(camera["normal"]), strict=True)
+            _number(group, f"port tilt {axis}", value, (own, total), ("deg", 1.0), word)
+            for axis, (value, own, total) in zip("xy", tilts_of(camera), strict=True)
         ]
         for name, key in (("azimuth phi", "azimuth"), ("tilt theta", "tilt")):
             known = camera[f"{key}_stddev_deg"], camera[f"{key}_stddev_in_all_deg"]
@@ -213,6 +213,13 @@ def budget_columns(summary: dict[str, Any]) -> tuple[str, ...]:
         elif camera["port"] == "dome":
             columns.append(f"{name}: centre ({unit})")
     return (*columns, "lengths (%)")
+
+
+def lengths_note(summary: dict[str, Any]) -> str:
+    """Why the budget has no errors of lengths; empty if it has."""
+    if unit_of(summary) != "units":
+        return ""
+    return "Lengths have no errors here, because the scale is arbitrary."
 
 
 def budget_lines(summary: dict[str, Any]) -> tuple[BudgetLine, ...]:

@@ -115,6 +115,16 @@ def tilts_deg(normal: list[float]) -> tuple[float, float]:
     return x, y
 
 
+def tilts_of(camera: dict[str, Any]) -> list[tuple[float, float | None, float | None]]:
+    """Each slope of a normal with its own deviations, from the images and in all; a
+    summary of an earlier version has none."""
+    none = [None, None]
+    own, total = (
+        camera.get(f"tilt_xy_stddev{kind}_deg", none) for kind in ("", "_in_all")
+    )
+    return list(zip(tilts_deg(camera["normal"]), own, total, strict=True))
+
+
 def known_length_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Given, its standard deviation, found, difference, millimetres; and the latter in
     standard deviations of what was given."""
@@ -220,11 +230,10 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
             text=f"dome, its centre at {center} from the projection centre",
             words=(("centre", camera["center_verdict"]),),
         )
-    stddev, total = camera["normal_stddev_deg"], camera["normal_stddev_in_all_deg"]
-    tilt = ", ".join(rounded(value, stddev) for value in tilts_deg(camera["normal"]))
-    known = "" if total is None else f" ± {deviation(total)}"
-    if stddev is not None:
-        known += f" (± {deviation(stddev)} from the images)"
+    tilt = " and ".join(
+        f"{with_deviations(*known, ('deg', 1.0))} towards {axis}"
+        for axis, known in zip("xy", tilts_of(camera), strict=True)
+    )
     distance = with_deviations(
         camera["distance_m"],
         camera["distance_stddev_m"],
@@ -233,8 +242,8 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
     )
     return PortVerdict(
         camera=name,
-        text=f"flat port, its normal tilted by {tilt}{known} deg towards x and y, at "
-        f"{distance} from the projection centre",
+        text=f"flat port, its normal tilted by {tilt}, at {distance} from the "
+        "projection centre",
         words=(
             ("tilt", camera["normal_verdict"]),
             ("distance", camera["distance_verdict"]),

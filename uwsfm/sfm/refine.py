@@ -87,57 +87,23 @@ def refine_scene(
     Raises:
         UwsfmError: nothing is left to adjust, or the result is not physical.
     """
-    options = {**rig_options(rig), **options}
-    given, steps = lengths or Lengths(), 0
-
-    def report(iteration: int, cost: float) -> None:
-        nonlocal steps
-        steps += 1
-        progress("refractive bundle adjustment", steps, None)
-
+    given = lengths or Lengths()
     calibrated = within_valid_radius(scene, rig)
     calibrated[given.clicked] = True
-    scene = _at_scale(retriangulated(scene, calibrated), given, calibrated)
-    start, known = scene, known or scene
-
-    def once(scene: Scene, keep: NDArray[np.bool_], **more: Any) -> CalibrationResult:
-        keep[given.clicked] = True
-        part, used = scene.select(_require(keep, scene))
-        inside = None
-        if lengths is not None:
-            inside = with_click_noise(given, scene).in_part(keep, used)
-        how = {**options, **more}
-        return calibrate(part, known=known, lengths=inside, report=report, **how)
-
-    def solve(
-        scene: Scene, keep: NDArray[np.bool_]
-    ) -> tuple[CalibrationResult, NDArray[np.bool_]]:
-        found = once(scene, keep)
-        return better_start(found, scene, keep, known.ports, once)
-
-    keep = good_observations(scene, MAX_START_ERROR_PX) & calibrated
-    last, keep = solve(scene, keep)
-    solves = last.summary.solves
-    for _ in range(MAX_ROUNDS):
-        num_before = np.count_nonzero(last.inliers)
-        trusted = np.zeros_like(keep)
-        trusted[np.nonzero(keep)[0][last.inliers]] = True
-        # Points that the start was too far off for get another chance, as a whole.
-        lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
-        trusted |= lost[scene.point_idx] & calibrated
-        scene = retriangulated(_with_result(scene, last), trusted)
-        keep = good_observations(scene, MAX_ERROR_PX) & calibrated
-        check_clicks(given, scene)
-        last, keep = solve(scene, keep)
-        solves += last.summary.solves
-        if np.count_nonzero(last.inliers) < WORTH_ANOTHER * num_before:
-            break
+    start = _at_scale(retriangulated(scene, calibrated), given, calibrated)
+    solver = _Solver(
+        known=known or start,
+        lengths=lengths,
+        calibrated=calibrated,
+        options={**rig_options(rig), **options},
+        progress=progress,
+    )
+    last, keep = solver.solved_in_rounds(start)
     clicks = np.isin(np.nonzero(keep)[0], given.clicked)
     found = last.inliers & ~clicks
     kept = np.nonzero(keep)[0][found]
     final, still = last.scene.select(found)
     before = start.residuals()[kept]
-    last = replace(last, summary=replace(last.summary, solves=solves))
     return Refined(
         scene=final,
         kept=kept,
@@ -145,6 +111,75 @@ def refine_scene(
         start_rms_px=float(np.sqrt(np.nanmean(np.sum(before**2, axis=1)))),
         num_tested=int(np.count_nonzero(calibrated)),
     )
+
+
+@dataclass(kw_only=True, eq=False)
+class _Solver:
+    """Solves a scene as often as that brings in observations."""
+
+    known: Scene
+    """Has the cameras and the rig that priors are around."""
+    lengths: Lengths | None
+    calibrated: NDArray[np.bool_]
+    """(N,) observations that the calibrations in air covered, and clicks."""
+    options: dict[str, Any]
+    progress: Progress
+    steps: int = 0
+    """Of all solves together."""
+
+    def solved_in_rounds(
+        self, scene: Scene
+    ) -> tuple[CalibrationResult, NDArray[np.bool_]]:
+        """The last solve, with the history of all, and which observations it had."""
+        keep = good_observations(scene, MAX_START_ERROR_PX) & self.calibrated
+        last, keep = self._solved(scene, keep)
+        solves = last.summary.solves
+        for _ in range(MAX_ROUNDS):
+            num_before = np.count_nonzero(last.inliers)
+            scene = retriangulated(
+                _with_result(scene, last), self._trusted(scene, last, keep)
+            )
+            keep = good_observations(scene, MAX_ERROR_PX) & self.calibrated
+            check_clicks(self.lengths or Lengths(), scene)
+            last, keep = self._solved(scene, keep)
+            solves += last.summary.solves
+            if np.count_nonzero(last.inliers) < WORTH_ANOTHER * num_before:
+                break
+        return replace(last, summary=replace(last.summary, solves=solves)), keep
+
+    def _trusted(
+        self, scene: Scene, last: CalibrationResult, keep: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """(N,) observations that shape the points of the next solve."""
+        trusted = np.zeros_like(keep)
+        trusted[np.nonzero(keep)[0][last.inliers]] = True
+        # Points that the start was too far off for get another chance, as a whole.
+        lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
+        return trusted | (lost[scene.point_idx] & self.calibrated)
+
+    def _solved(
+        self, scene: Scene, keep: NDArray[np.bool_]
+    ) -> tuple[CalibrationResult, NDArray[np.bool_]]:
+        found = self._once(scene, keep)
+        return better_start(found, scene, keep, self.known.ports, self._once)
+
+    def _once(
+        self, scene: Scene, keep: NDArray[np.bool_], **more: Any
+    ) -> CalibrationResult:
+        inside = None
+        if self.lengths is not None:
+            keep[self.lengths.clicked] = True
+        part, used = scene.select(_require(keep, scene))
+        if self.lengths is not None:
+            inside = with_click_noise(self.lengths, scene).in_part(keep, used)
+        how = {**self.options, **more}
+        return calibrate(
+            part, known=self.known, lengths=inside, report=self._report, **how
+        )
+
+    def _report(self, iteration: int, cost: float) -> None:
+        self.steps += 1
+        self.progress("refractive bundle adjustment", self.steps, None)
 
 
 def without_empty_frames(refined: Refined) -> tuple[Refined, IndexArray]:

@@ -101,9 +101,13 @@ def _pose_row(eqs, c, inverse, frame, j, row):
 
 
 @kernel
-def _shares(layout, state, eqs, inverses, cluster, share, pull):
-    """Sums over each cluster, by the pose of its frame: J~^T J~ (clusters, 6, 6) and
-    J~^T r (clusters, 6)."""
+def _by_poses(layout, state, eqs, inverses, cluster, steps, share, pull, along):
+    """What observations are by the poses of their frames, whose rows of J~ it makes.
+
+    With no ``steps`` yet, sums over each cluster: J~^T J~ in ``share`` (clusters, 6, 6)
+    and J~^T r in ``pull`` (clusters, 6); then with steps (clusters, 6) of the poses,
+    J~ step of each observation in ``along`` (N, 2). Nothing of a frame that is held.
+    """
     j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
     j_border, row = np.zeros((2, BORDER_SIZE)), np.empty(6)
     for p in range(len(layout.point_start) - 1):
@@ -122,6 +126,9 @@ def _shares(layout, state, eqs, inverses, cluster, share, pull):
                 for a, residual in enumerate((rx, ry)):
                     _pose_row(eqs, c, inverses[p], frame, j_rig[a], row)
                     for m in range(6):
+                        if len(steps):
+                            along[i, a] += row[m] * steps[own, m]
+                            continue
                         pull[own, m] += row[m] * residual
                         for n in range(6):
                             share[own, m, n] += row[m] * row[n]
@@ -180,27 +187,6 @@ def _scores(layout, state, eqs, inverses, cluster, rows, given_back, out):
                     of_point,
                     score,
                 )
-
-
-@kernel
-def _along_steps(layout, state, eqs, inverses, cluster, steps, out):
-    """J~ step of each observation (N, 2), for the steps (clusters, 6) of the poses."""
-    j_port, j_rig = np.empty((2, JAC_SIZE)), np.empty((2, 3))
-    j_border, row = np.zeros((2, BORDER_SIZE)), np.empty(6)
-    for p in range(len(layout.point_start) - 1):
-        for c in range(layout.point_start[p], layout.point_start[p + 1]):
-            frame = state.frames[layout.cell_frame[c]]
-            x, y, z = point_in_rig(frame, state.points[p])
-            for i in range(layout.cell_start[c], layout.cell_start[c + 1]):
-                status, _, _ = linearized_residual(
-                    layout, state, i, x, y, z, j_port, j_rig, j_border
-                )
-                if status != VALID:
-                    continue
-                for a in range(2):
-                    _pose_row(eqs, c, inverses[p], frame, j_rig[a], row)
-                    for m in range(6):
-                        out[i, a] += row[m] * steps[cluster[i], m]
 
 
 def clustered_covariance(
@@ -262,14 +248,14 @@ def given_back(
     """
     num_clusters = int(cluster.max()) + 1
     share, pull = np.zeros((num_clusters, 6, 6)), np.zeros((num_clusters, 6))
-    _shares(layout, state, eqs, reduced.points, cluster, share, pull)
+    out, problem = np.zeros((len(layout.xy), 2)), (layout, state, eqs, reduced.points)
+    _by_poses(*problem, cluster, np.empty((0, 6)), share, pull, out)
     frame = np.zeros(num_clusters, dtype=np.int64)
     frame[cluster] = np.repeat(layout.cell_frame, np.diff(layout.cell_start))
     whole = reduced.poses[frame]
     whole[layout.frame_col[frame] == HELD] = np.eye(6)
     steps = _steps_without(whole, share, pull)
-    out = np.zeros((len(layout.xy), 2))
-    _along_steps(layout, state, eqs, reduced.points, cluster, steps, out)
+    _by_poses(*problem, cluster, steps, share, pull, out)
     return out
 
 

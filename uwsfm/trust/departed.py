@@ -102,27 +102,30 @@ def _dome(item: Departure) -> Reason | None:
 
 
 def _focal(item: Departure) -> Reason | None:
-    if item.z < DEPARTED:
-        return None
     text = (
-        f"Camera {item.camera}: the focal length came out at {item.estimate:.3f} ± "
-        f"{item.stddev:.2g} times the given one ({_stated(item, '{:.2g}')}); check "
-        "that it was calibrated in air, at this resolution and zoom."
+        f"the focal length came out at {item.estimate:.3f} ± {item.stddev:.2g} times "
+        f"the given one ({_stated(item, '{:.2g}')}); check that it was calibrated in "
+        "air, at this resolution and zoom."
     )
-    severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
-    return reason("focal_length", text, severity, **_numbers(item))
+    return _lens(item, "focal_length", text)
 
 
 def _principal_point(item: Departure) -> Reason | None:
+    text = (
+        f"the principal point moved by {item.estimate:.3g} ± {item.stddev:.2g} px "
+        f"({_stated(item, '{:.2g} px')}); check that the lens was calibrated on images "
+        "of this crop and orientation."
+    )
+    return _lens(item, "principal_point", text)
+
+
+def _lens(item: Departure, code: str, what: str) -> Reason | None:
+    """A number of a lens that has left its calibration."""
     if item.z < DEPARTED:
         return None
-    text = (
-        f"Camera {item.camera}: the principal point moved by {item.estimate:.3g} ± "
-        f"{item.stddev:.2g} px ({_stated(item, '{:.2g} px')}); check that the "
-        "lens was calibrated on images of this crop and orientation."
-    )
     severity = DOES_NOT_FIT if item.z_at_least >= FAR_DEPARTED else DOUBTFUL
-    return reason("principal_point", text, severity, **_numbers(item))
+    text = f"Camera {item.camera}: {what}"
+    return reason(code, text, severity, **_numbers(item))
 
 
 def _stated(item: Departure, form: str) -> str:

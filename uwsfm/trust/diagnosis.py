@@ -44,6 +44,8 @@ housing, to the centre of a lens that nobody sees."""
 AT_ZERO = 2.0
 """Strain of a port that came out at its lens, which no housing has."""
 MAX_EXPLANATIONS = 3
+OF_WHAT = "of the best 90 % of a sample of the observations"
+"""See `uwsfm.trust.trials`: a mistake makes outliers of good matches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,9 +257,9 @@ def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]
 
 def _explained(base: Tried, one: Tried) -> Explanation:
     before, after = base.fit.rms_px, one.fit.rms_px
-    evidence = [f"{before:.2f} px becomes {after:.2f}"]
+    evidence = [f"the RMS error {OF_WHAT} falls from {before:.2f} to {after:.2f} px"]
     if before < after * (1.0 + UNIT):
-        evidence = [f"the RMS stays at {after:.2f} px"]
+        evidence = [f"the RMS error {OF_WHAT} stays at {after:.2f} px"]
     evidence += [*_port_evidence(base, one), *_turn_evidence(base, one)]
     told, remedy = one.trial.estimate(one.fit), one.trial.remedy
     return Explanation(

@@ -120,6 +120,29 @@ def costs_little(calibration: CalibrationResult) -> bool:
     return frames >= MIN_FRAMES and count <= LITTLE_WORK
 
 
+def cross_validate_if_cheap(
+    rig: Rig, calibration: CalibrationResult
+) -> CrossValidation | None:
+    """`cross_validate` where it costs little, without losing a result to it.
+
+    Returns:
+        None if there are too few frames, or too many observations; without splits, but
+        with the reason, if the halves could not be adjusted.
+    """
+    if not costs_little(calibration) or not calibration.covariance.determined:
+        return None
+    try:
+        return cross_validate(rig, calibration)
+    except (UwsfmError, np.linalg.LinAlgError) as error:  # the result is worth more
+        return CrossValidation(
+            unit=_unit(calibration), splits=(), omitted=(str(error),)
+        )
+
+
+def _unit(calibration: CalibrationResult) -> str:
+    return "units" if calibration.covariance.scale_stddev is None else "m"
+
+
 def cross_validate(
     rig: Rig, calibration: CalibrationResult, *, seed: int = 0
 ) -> CrossValidation:
@@ -141,7 +164,7 @@ def cross_validate(
     if len(frames) < MIN_FRAMES:
         raise UwsfmError(
             f"the result has {len(frames)} frames: halves that can be compared need "
-            f"{MIN_FRAMES} or more"
+            f"{MIN_FRAMES} or more, so a result of so few cannot be cross-validated"
         )
     middle = (len(frames) + 1) // 2
     ways = {
@@ -157,9 +180,8 @@ def cross_validate(
             omitted.append(f"The halves {name} could not be compared: {error}.")
     if not splits:
         raise UwsfmError(" ".join(omitted))
-    arbitrary = calibration.covariance.scale_stddev is None
     return CrossValidation(
-        unit="units" if arbitrary else "m",
+        unit=_unit(calibration),
         splits=tuple(splits),
         omitted=tuple(omitted),
     )

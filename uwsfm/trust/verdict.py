@@ -9,6 +9,8 @@ rigs, the rendered sample) and what mistakes give; `pipelines/trust` has the tab
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -99,21 +101,19 @@ def judged(rig: Rig, calibration: CalibrationResult, used: Used) -> Verdict:
     return judge(rig, calibration, noise_floor(scene), used)
 
 
-def refined_verdict(rig: Rig, refined: Refined, num_frames: int) -> Verdict:
-    """The verdict on a refined scene.
+def used_of(refined: Refined, num_frames: int) -> Used:
+    """How much of the input a refined scene has.
 
     Args:
-        rig: As given.
         refined: The result.
         num_frames: That there were, registered or not.
     """
-    used = Used(
+    return Used(
         num_frames=num_frames,
         num_registered=len(distinct(refined.scene.frame_idx)),
         num_tested=refined.num_tested,
         num_kept=len(refined.kept),
     )
-    return judged(rig, refined.calibration, used)
 
 
 def verdict_on(goodness: Goodness) -> Verdict:
@@ -124,6 +124,7 @@ def verdict_on(goodness: Goodness) -> Verdict:
         *departed_reasons(goodness.departures),
         *_below_zero(goodness),
         *_used(goodness.used),
+        *_too_little(goodness),
         *_outside(goodness),
     ]
     if not goodness.converged:
@@ -132,10 +133,19 @@ def verdict_on(goodness: Goodness) -> Verdict:
             "those of no optimum."
         )
         reasons.append(reason("not_converged", text, DOUBTFUL))
+    return _verdict(goodness, reasons)
+
+
+def with_reasons(verdict: Verdict, more: Sequence[Reason]) -> Verdict:
+    """A verdict with further reasons, and the word that they all lead to."""
+    return _verdict(verdict.goodness, [*verdict.reasons, *more])
+
+
+def _verdict(goodness: Goodness, reasons: Sequence[Reason]) -> Verdict:
     # A stable order: the severe ones first, otherwise as they were found.
-    reasons.sort(key=lambda reason: reason.severity != DOES_NOT_FIT)
-    word: Word = reasons[0].severity if reasons else FITS
-    return Verdict(verdict=word, reasons=tuple(reasons), goodness=goodness)
+    ordered = sorted(reasons, key=lambda reason: reason.severity != DOES_NOT_FIT)
+    word: Word = ordered[0].severity if ordered else FITS
+    return Verdict(verdict=word, reasons=tuple(ordered), goodness=goodness)
 
 
 def _floor(goodness: Goodness) -> list[Reason]:
@@ -143,8 +153,9 @@ def _floor(goodness: Goodness) -> list[Reason]:
     if floor is None or floor.ratio < ABOVE_FLOOR:
         return []
     text = (
-        f"The model leaves {floor.model_px:.2g} px RMS, {floor.ratio:.1f} times the "
-        f"{floor.floor_px:.2g} px that the best geometry of each pair of images leaves "
+        f"The model leaves {floor.model_px:.2g} px RMS (per coordinate, of "
+        f"{floor.num_matches} matches between pairs of images), {floor.ratio:.1f} "
+        f"times the {floor.floor_px:.2g} px that the best geometry of each pair leaves "
         "of the same matches: the images agree with each other, not with this model."
     )
     severity = DOES_NOT_FIT if floor.ratio >= FAR_ABOVE_FLOOR else DOUBTFUL
@@ -181,9 +192,9 @@ def _systematic(goodness: Goodness) -> list[Reason]:
             continue
         blamed = blamed or part.by in ("place", "depth", "row")
         text = (
-            f"The residuals repeat {_BY[part.by]}: {part.px:.2g} px are systematic, "
-            f"beside a noise of {goodness.sigma_px:.2g} px per coordinate "
-            f"({_chance(part.p_value)})."
+            f"The residuals of the result's observations repeat {_BY[part.by]}: "
+            f"{part.px:.2g} px RMS are systematic, beside a noise of "
+            f"{goodness.sigma_px:.2g} px per coordinate ({_chance(part.p_value)})."
         )
         numbers = {"px": part.px, "p_value": part.p_value}
         reasons.append(reason(f"systematic_by_{part.by}", text, severity, **numbers))
@@ -200,7 +211,7 @@ def _lenses(goodness: Goodness) -> list[Reason]:
             continue
         text = (
             f"Camera {camera.name}: it is the lens, as given, that does not fit. "
-            f"{px:.2g} px of the residuals are systematic by place in the image "
+            f"{px:.2g} px RMS of its residuals are systematic by place in the image "
             f"({_chance(camera.p_value)}), and {freed:.2g} px if the lens is free: "
             "check its calibration, or refine it."
         )
@@ -224,9 +235,9 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         )
     else:
         text += (
-            f"but a noise of {free.sigma_px:.2g} px is left, where pairs of images "
-            f"alone have {floor.floor_px:.2g} px, so it is not the lenses alone; check "
-            "the placement of the cameras and the ports as well."
+            f"but a noise of {free.sigma_px:.2g} px is left, where matches of pairs of "
+            f"images alone have {floor.floor_px:.2g} px, so it is not the lenses "
+            "alone; check the placement of the cameras and the ports as well."
         )
     numbers = {"px": free.px, "p_value": free.p_value, "gain": free.gain}
     return [reason("lenses_do_not_fit", text, severity, **numbers)]
@@ -283,6 +294,25 @@ def _used(used: Used) -> list[Reason]:
             severity = DOES_NOT_FIT if share < FEWEST_KEPT else DOUBTFUL
             reasons.append(reason("few_observations", text, severity, share=share))
     return reasons
+
+
+def _too_little(goodness: Goodness) -> list[Reason]:
+    """Tests that no wrong input could have failed, as they had too little to go by."""
+    missing = []
+    if goodness.floor is None:
+        missing.append("no two images share enough points for their noise floor")
+    if all(math.isnan(p.p_value) for p in goodness.parts if p.by == "place"):
+        missing.append(
+            "too few images see the same part of the picture for what repeats there"
+        )
+    if not missing:
+        return []
+    frames = goodness.used.num_registered
+    text = (
+        "There is too little data to tell whether the model fits: "
+        f"{' and '.join(missing)} ({frames} frames). Give more frames that overlap."
+    )
+    return [reason("too_little_data", text, DOUBTFUL, frames=frames)]
 
 
 def _outside(goodness: Goodness) -> list[Reason]:

@@ -1,0 +1,39 @@
+"""Halves of the frames that differ far, as a reason of a verdict."""
+
+from uwsfm.trust.halves import CrossValidation
+from uwsfm.trust.reason import DOUBTFUL, Reason, reason
+
+CODE = "halves_differ"
+FAR_APART = 3.0
+"""Times the prediction, and significant. Up to it, deviations are enlarged and that is
+all: a real rig in a tank has 1.3 to 2.1, as its lens fits badly; a port that was
+mounted anew midway, 10 mm farther away, has more."""
+NAMES = {
+    "tilt": "port tilts",
+    "distance": "port distances",
+    "center": "dome centres",
+    "rotation": "rotations of cam_from_rig",
+    "direction": "directions of the baselines",
+    "baseline": "lengths of the baselines",
+    "water index": "water indices",
+    "lens": "lenses",
+    "length": "distances between points",
+    "scale": "scale",
+}
+"""Groups of numbers that halves are compared by, for people."""
+
+
+def halves_reasons(found: CrossValidation | None) -> list[Reason]:
+    """A reason if the halves differ so far that the rig was not one and the same."""
+    enlarged = {} if found is None else found.enlarged
+    far = {group: factor for group, factor in enlarged.items() if factor > FAR_APART}
+    if not far:
+        return []
+    worst = max(far, key=lambda group: far[group])
+    text = (
+        f"Halves of the frames, each adjusted alone, differ in their {NAMES[worst]} by "
+        f"{far[worst]:.1f} times what their standard deviations predict: something "
+        "changed during the dive (a lens, a port, the placement of the cameras), or "
+        "the model does not fit all frames alike."
+    )
+    return [reason(CODE, text, DOUBTFUL, ratio=far[worst])]
