@@ -15,10 +15,11 @@ from command_line import one_sentence, run
 from filelock import FileLock
 from sfm_scenes import model_of
 
-from uwsfm.console import console, housing_table
+from uwsfm.console import console
 from uwsfm.export.files import export_colmap
 from uwsfm.export.housing import export_housing
 from uwsfm.pipeline import WORK
+from uwsfm.result_tables import housing_table
 from uwsfm.rig_file import load_rig
 from uwsfm.simulate import ObservationOptions, simulate_scene
 from uwsfm.simulate.rigs import sample_rig

@@ -1,17 +1,22 @@
 """Linear propagation of wrong given numbers, against solving again with them."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from given_changes import scaled_accuracy, with_changes
+from rich.console import Console
 from test_mixed_ports import dive as mixed_dive
 
 from uwsfm import calibrate, error_budget
 from uwsfm.calibration.error_budget import TOGETHER, with_budget
 from uwsfm.calibration.given_errors import given_reach, in_all
 from uwsfm.calibration.given_items import given_items
+from uwsfm.export.summary import budget_summary, housing_summary, scale_summary
+from uwsfm.report.tables import budget_lines, lengths_note
 from uwsfm.residuals import border
+from uwsfm.result_tables import budget_table
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -157,6 +162,46 @@ def test_rows_are_sorted_and_say_what_was_assumed(optimum):
         assert f"{name}, all cameras alike" in names
     assert {"water index", "baseline of right"} < names
     assert all(row.assumed and not row.prior for row in rows)
+
+
+def test_rows_are_sorted_by_what_tables_show(optimum):
+    """Distances and lengths here, each in its deviation in all; no turn of the rig."""
+    result, budget = with_budget(solved(optimum, refine_normals=False))
+    in_all = result.covariance.in_all
+    columns = result.covariance.border_cols[:, border.DISTANCE]
+    for row in budget[:-1]:
+        effects = [
+            abs(shift.distance_m) / np.sqrt(in_all.border[k, k])
+            for shift, k in zip(row.shifts, columns, strict=True)
+        ]
+        effects.append(abs(row.scale) / in_all.scale_stddev)
+        assert row.share == pytest.approx(max(effects), rel=1e-6)
+
+
+def test_lengths_without_a_unit_have_no_errors(optimum):
+    """One camera and nothing that gives scale: not 0.00 %, but none, and why."""
+    alone, _ = optimum.select(optimum.camera_idx == 0)
+    alone = replace(
+        alone, cameras=alone.cameras[:1], cam_from_rig=alone.cam_from_rig[:1]
+    )
+    result = calibrate(alone, loss="l2")
+    assert result.covariance.scale_stddev is None
+    rig = sample_rig()
+    one = replace(rig, cameras=rig.cameras[:1], cam_from_rig=None, baseline_m=None)
+    scale = scale_summary(result)
+    rows = budget_summary(error_budget(result), result.covariance.scale_stddev)
+    assert {row["scale"] for row in rows} == {None}
+    summary = {
+        "error_budget": rows,
+        "cameras": housing_summary(one, result),
+        "scale": scale,
+    }
+    console = Console(width=150, record=True, file=io.StringIO())
+    console.print(budget_table(summary))
+    text = console.export_text()
+    assert "because the scale is arbitrary" in text and "0.00 %" not in text
+    assert lengths_note(summary) and not lengths_note({"scale": {"unit": "metre"}})
+    assert all(line.effects[-1] == "-" for line in budget_lines(summary))
 
 
 def test_in_all_is_the_images_and_the_budget(optimum):

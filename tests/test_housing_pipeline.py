@@ -14,7 +14,8 @@ import uwsfm
 from uwsfm.demo import sample_dir
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import unit_vector
-from uwsfm.housing_pipeline import CALIBRATION, calibrate_housing
+from uwsfm.housing_pipeline import calibrate_housing
+from uwsfm.output_folder import HOUSING_SUMMARY
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
@@ -68,14 +69,14 @@ def test_a_colmap_model_gives_the_housing(dive, tmp_path, strategy, start):
     # The scale is that of the rig file, not of the model.
     assert result.rig.baseline_m == pytest.approx(0.2, rel=1e-9)
     assert uwsfm.load_rig(tmp_path / "housing.yaml").cameras[0].port.distance > 0.015
-    found = json.loads((tmp_path / CALIBRATION).read_text())
+    found = json.loads((tmp_path / HOUSING_SUMMARY).read_text())
     assert (found["strategy"], found["start"]) == (strategy, start)
     # 3800 observations tell their noise to 1.5 %; pruning at 3.5 takes 0.7 %.
     assert found["sigma_px"] == pytest.approx(NOISE_PX, rel=0.05)
     # The rig of a simulation is exact: nothing that was given can be wrong.
     assert [row["if"] for row in found["error_budget"]] == ["all of these together"]
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"housing.yaml", CALIBRATION, "uwsfm-work"}
+    assert names == {"housing.yaml", HOUSING_SUMMARY, "uwsfm-work"}
 
 
 def test_refined_water_and_lenses_arrive_in_the_housing(dive, tmp_path):

@@ -19,7 +19,7 @@ from uwsfm import (
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import budget_summary, housing_summary
-from uwsfm.pipeline import housing_warnings
+from uwsfm.judgement import housing_warnings
 from uwsfm.rig import Rig
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import (
@@ -96,7 +96,8 @@ def test_what_is_said_of_a_dome(tmp_path):
     assert dome["port"] == "dome" and dome["center_verdict"] == "determined"
     assert min(dome["center_stddev_m"]) > 0.0
     assert bare["port"] == "none" and "normal" not in bare
-    rows = {row["if"]: row["cameras"] for row in budget_summary(error_budget(result))}
+    budget = budget_summary(error_budget(result), result.covariance.scale_stddev)
+    rows = {row["if"]: row["cameras"] for row in budget}
     assert np.linalg.norm(rows["dome radius of camera 1"][1]["center_m"]) > 1e-4
     assert rows["water index"][2]["center_m"] == [0.0, 0.0, 0.0]
     assert verdicts(result, ["a", "b", "c"]) == ()

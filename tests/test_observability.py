@@ -32,15 +32,15 @@ def test_a_good_dive_needs_no_words():
 def test_a_flat_floor_at_constant_altitude_leaves_the_common_distance():
     sentences, result = told(dive(straight_strip(15), 0.0))
     weak = sentences[0]
-    assert weak.startswith("the common distance of both ports is ")
+    assert weak.startswith("the port distances of left and right, moved together, are ")
     assert "by a flat sea floor at constant altitude: standard deviation " in weak
-    assert weak.endswith(" mm; fly at two altitudes")
+    assert weak.endswith(" mm each; fly at two altitudes")
     # The number is that of either port: they are wrong together.
     said = float(weak.split("deviation ")[1].split(" mm")[0])
     alone = [1e3 * camera.distance_stddev_m for camera in result.covariance.cameras]
     assert said == pytest.approx(np.mean(alone), rel=0.1)
     # Their difference is not among the complaints.
-    assert not any("distances of both" in sentence for sentence in sentences)
+    assert not any("against each other" in sentence for sentence in sentences)
 
 
 def test_relief_at_constant_altitude_and_few_frames_are_told_apart():
@@ -57,7 +57,7 @@ def test_relief_at_constant_altitude_and_few_frames_are_told_apart():
 def test_one_port_refined_is_named():
     options = {"refine_distances": (False, True), "refine_normals": False}
     sentences, _ = told(dive(straight_strip(4), 0.0), **options)
-    assert sentences[0].startswith("the distance of the port of right is ")
+    assert sentences[0].startswith("the port distance of right is ")
 
 
 def test_a_tilt_that_is_lost_in_noise_is_told():

@@ -9,7 +9,7 @@ import pytest
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.output_folder import locked, output_folder
+from uwsfm.output_folder import locked, made_of_files, output_folder
 
 
 def assert_same(found, expected):
@@ -141,3 +141,20 @@ def test_what_a_stopped_run_has_written_stays_and_is_ours(tmp_path, written):
         (out / written).touch()
         raise KeyboardInterrupt
     assert (out / written).exists() and output_folder(out) == out
+
+
+def test_a_result_of_another_job_is_not_overwritten(dive_result, tmp_path):
+    """The same model from elsewhere is another job; the same command is the same."""
+    folder, out = dive_result.out.parent, tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    other = shutil.copytree(folder / "model", tmp_path / "other")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=f"result of another job, made of {folder}"):
+        uwsfm.refine_model(other, folder / "rig.yaml", out)
+    assert all(path.read_bytes() == data for path, data in before.items())
+    made_of = made_of_files(folder / "rig.yaml", folder / "model")
+    assert output_folder(out, made_of=made_of) == out
+    with pytest.raises(InputError, match=r"made of .*rig\.yaml and not of .*b\.yaml"):
+        output_folder(out, made_of={**made_of, "rig": str(tmp_path / "b.yaml")})
+    unknown = made_of_files(dive_result.result.model.rig, folder / "model")
+    assert output_folder(out, made_of=unknown) == out  # a rig that is no file

@@ -1,7 +1,7 @@
 """How well given numbers are known: read from a rig file, refused, written again."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -16,12 +16,15 @@ from uwsfm.calibration.given_accuracy import (
     NamedCovariance,
     RigAccuracy,
 )
+from uwsfm.calibration.problem import PRIORS
 from uwsfm.calibration.tilt import paper_tilt
+from uwsfm.cli_options import priors_of
 from uwsfm.errors import InputError
 from uwsfm.export.housing import export_housing
 from uwsfm.models.port import FlatPort
 from uwsfm.residuals import border
 from uwsfm.rig_file import dump_rig, load_rig, template
+from uwsfm.rig_values import ACCURACIES
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -109,7 +112,7 @@ def test_the_covariance_of_a_translation_is_that_of_direction_and_length(tmp_pat
 def test_accuracy_survives_the_file(tmp_path):
     covariance = NamedCovariance(names=tuple(NAMES), matrix=np.array(MATRIX))
     rig = sample_rig()
-    own = CameraAccuracy(focal=2e-3, distortion=(1e-3, 2e-3, 1e-4, 1e-4))
+    own = CameraAccuracy(principal_point_px=0.4, thickness_m=1e-4)
     cameras = (replace(rig.cameras[0], accuracy=own), rig.cameras[1])
     for shared in (
         RigAccuracy(exact=True),
@@ -140,6 +143,22 @@ def _with(row, column, value):
 REFUSED = {
     "cameras[0].accuracy.focal: must be at least 0": {"left": {"focal": -1e-3}},
     "cameras[0].accuracy.focal: must be a finite": {"left": {"focal": float("nan")}},
+    "cameras[0].accuracy.focal: 0.5 is no plausible standard deviation; it is given as "
+    "a share of the focal length": {"left": {"focal": 0.5}},
+    "cameras[1].accuracy.distance_m: 2 is no plausible": {"right": {"distance_m": 2.0}},
+    "accuracy.baseline_m: 1.5 is no plausible": {"shared": {"baseline_m": 1.5}},
+    "accuracy.distortion[0] is 5, which would move the image corner by 3": {
+        "left": {"distortion": [5.0, 0.1, 0.001, 0.001]}
+    },
+    "camera 'left': accuracy.focal and accuracy.covariance state the accuracy of the "
+    "same numbers": {
+        "shared": {"covariance": {"names": ["left.fx"], "matrix": [[4.0]]}},
+        "left": {"focal": 1e-3},
+    },
+    "camera 'right': accuracy.rotation_deg and accuracy.covariance": {
+        "shared": {"covariance": {"names": ["right.rotation_z"], "matrix": [[1e-6]]}},
+        "right": {"rotation_deg": 0.1},
+    },
     "accuracy.focl: unknown key, did you mean focal?": {"left": {"focl": 1e-3}},
     "accuracy.distortion has 2 values, its lens model has 4": {
         "left": {"distortion": [0.1, 0.1]}
@@ -249,3 +268,34 @@ def test_azimuth_and_tilt_are_the_normal_and_share_its_deviation(solved):
         ) == pytest.approx(stddev, rel=1e-6)
         assert known.tilt_stddev_deg < known.tilt_stddev_in_all_deg
         assert known.azimuth_stddev_deg < known.azimuth_stddev_in_all_deg
+
+
+def test_every_stated_accuracy_has_a_range_and_every_prior(tmp_path):
+    """Or another declaration that refuses it: of distortion, by what it moves."""
+    shared = {"baseline_m", "water_index"}
+    own = {field.name for field in fields(CameraAccuracy)}
+    assert set(ACCURACIES) == own - {"distortion"} | shared
+    for prior in PRIORS:
+        key = prior.replace("_stddev", "")
+        if key == "distortion":
+            continue
+        most, _ = ACCURACIES[key]
+        assert priors_of([f"{prior}={0.5 * most}"]) == {prior: 0.5 * most}
+        with pytest.raises(InputError, match=f"--prior {prior}=.*no plausible"):
+            priors_of([f"{prior}={2.0 * most}"])
+
+
+def test_a_housing_states_the_rotation_that_was_estimated_and_loads_again(tmp_path):
+    """Its covariance was of the rotation before, and would contradict it."""
+    covariance = NamedCovariance(names=tuple(NAMES), matrix=np.array(MATRIX))
+    rig = replace(sample_rig(), accuracy=RigAccuracy(covariance=covariance))
+    options = ObservationOptions(num_points=80, noise_px=0.3)
+    dive = simulate_scene(rig, rich_motion(4), Relief(stddev=0.2), options)
+    given = rig.given_accuracy()
+    result, _ = with_budget(calibrate(dive.scene, loss="l2", given=given))
+    export_housing(rig, tmp_path / "housing.yaml", result)
+    again = load_rig(tmp_path / "housing.yaml")
+    assert again.accuracy.covariance.names == tuple(NAMES[:3])
+    found = again.cameras[1].accuracy.rotation_deg
+    known = result.covariance.in_all.cameras[1].rotation_stddev_deg
+    assert found == pytest.approx(known / np.sqrt(3.0), rel=1e-3)

@@ -12,16 +12,23 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from uwsfm import UwsfmError, calibrate
-from uwsfm.check_halves import check_halves
+from uwsfm.calibration.enlarged import enlarged
+from uwsfm.calibration.error_budget import with_budget
+from uwsfm.calibration.observability import verdicts
+from uwsfm.check_halves import check_halves, cross_validated
 from uwsfm.cli import app
 from uwsfm.cli_check import halves_table
-from uwsfm.export.halves_summary import KEY, halves_numbers, with_cross_validation
-from uwsfm.export.summary import housing_summary, scale_summary
+from uwsfm.export.halves_summary import KEY, halves_numbers
+from uwsfm.export.summary import housing_summary
 from uwsfm.geometry import rigid3
+from uwsfm.report.halves import halves_of, halves_payload
+from uwsfm.residuals import border
+from uwsfm.result_folder import given_rig, open_result
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
 from uwsfm.trust.halves import IN_ORDER, INTERLEAVED, CrossValidation, cross_validate
+from uwsfm.trust.halves_reason import FAR_APART, halves_reasons
 from uwsfm.trust.projections import projection_map
 from uwsfm.trust.shared_numbers import shared_numbers
 
@@ -184,23 +191,96 @@ def test_projections_of_a_turned_port_are_off_by_as_much_as_pixels_are():
     assert np.all(np.abs(ratio - 1.0) < 0.03)
 
 
-def test_deviations_in_the_summary_are_enlarged_once(remounted, solved):
-    names = RIG
-    summary = {
-        "cameras": housing_summary(names, solved),
-        "scale": scale_summary(solved),
-        "warnings": [],
-    }
-    once = with_cross_validation(summary, remounted)
+def test_enlarged_deviations_are_one_number_everywhere(remounted, solved):
+    """In the covariance, the summary and the notes; what was given adds as before."""
+    whole, budget = with_budget(solved)
+    larger = enlarged(whole, remounted.enlarged)
     factor = remounted.enlarged["distance"]
-    own = [s["cameras"][0]["distance_stddev_m"] for s in (summary, once)]
-    assert own[1] == pytest.approx(factor * own[0])
-    assert f"enlarged by {factor:.1f}" in " ".join(once[KEY]["sentences"])
-    twice = with_cross_validation(once, remounted)
-    again = twice["cameras"][0]["distance_stddev_m"]
-    assert again == pytest.approx(own[1])  # not once more
-    numbers = halves_numbers(remounted)["splits"][1]["numbers"]
-    assert {n["name"] for n in numbers} >= {"port distance of right", "tilt x of left"}
+    covariance, before = larger.covariance, whole.covariance
+    totals = zip(before.in_all.cameras, covariance.in_all.cameras, strict=True)
+    cameras = zip(before.cameras, covariance.cameras, totals, strict=True)
+    entries = housing_summary(RIG, larger)
+    columns = before.border_cols[:, border.DISTANCE]
+    for entry, (own, more, (old, new)), k in zip(
+        entries, cameras, columns, strict=True
+    ):
+        assert more.distance_stddev_m == pytest.approx(factor * own.distance_stddev_m)
+        # Of a root sum of squares, only the part of the images has grown.
+        assert new.distance_stddev_m == pytest.approx(
+            np.sqrt(
+                old.distance_stddev_m**2 + (factor**2 - 1.0) * own.distance_stddev_m**2
+            )
+        )
+        assert entry["distance_stddev_m"] == more.distance_stddev_m
+        assert entry["distance_stddev_in_all_m"] == new.distance_stddev_m
+        assert covariance.border[k, k] == pytest.approx(factor**2 * before.border[k, k])
+    hundred = enlarged(whole, {"distance": 100.0})
+    names = ["left", "right"]
+    notes = [" ".join(verdicts(each, names, budget)) for each in (whole, hundred)]
+    assert "port distance" not in notes[0] and "port distance" in notes[1]
+    with pytest.raises(AssertionError, match="enlarged once"):
+        enlarged(larger, remounted.enlarged)
+
+
+def with_ratio(found: CrossValidation, group: str, ratio: float) -> CrossValidation:
+    """Halves that differ in one group by so many times, beyond any chance."""
+    splits = []
+    for split in found.splits:
+        agreements = tuple(
+            replace(a, ratio=ratio, p_value=1e-9) if a.group == group else a
+            for a in split.agreements
+        )
+        splits.append(replace(split, agreements=agreements))
+    return replace(found, splits=tuple(splits))
+
+
+def test_halves_that_differ_far_are_a_reason_and_others_are_not(right, remounted):
+    assert halves_reasons(None) == halves_reasons(right) == []
+    near = with_ratio(right, "distance", 0.99 * FAR_APART)
+    assert near.enlarged and halves_reasons(near) == []
+    (reason,) = halves_reasons(with_ratio(right, "distance", 5.0))
+    assert (
+        reason.severity == "doubtful" and "port distances by 5.0 times" in reason.text
+    )
+    # 10 mm of 0.4 that one port's distance is known to, beside the other's.
+    assert halves_reasons(remounted)
+
+
+def test_halves_with_nothing_estimated_say_so(solved):
+    """All that could differ is held: 1e-14 px is no agreement."""
+    hold = {
+        "refine_distances": False,
+        "refine_normals": False,
+        "refine_cam_from_rig": False,
+    }
+    found = cross_validate(RIG, calibrate(solved.scene, loss="l2", **hold))
+    numbers = halves_numbers(found)
+    for sentence in numbers["sentences"][:2]:
+        assert "is estimated here" in sentence and "px" not in sentence
+    shown = halves_of({KEY: numbers})
+    assert shown["split"] is None and halves_payload({KEY: numbers}) == {}
+
+
+def test_halves_change_verdict_words_and_notes_of_a_stored_result(dive_result):
+    """And another cross-validation takes all of it back."""
+    result, given = open_result(dive_result.out), given_rig(dive_result.out)
+    found = cross_validate(given, result.solved)
+    assert found.enlarged == {}
+    far = cross_validated(result, given, with_ratio(found, "distance", 50.0))
+    assert far["verdict"] == "doubtful"
+    assert [reason["code"] for reason in far["reasons"]] == ["halves_differ"]
+    for old, new in zip(result.summary["cameras"], far["cameras"], strict=True):
+        own = old["distance_stddev_m"]
+        assert new["distance_stddev_m"] == pytest.approx(50.0 * own)
+        assert new["distance_verdict"] != "determined"
+    added = set(far["warnings"]) - set(result.summary["warnings"])
+    assert any("port distance" in note for note in added)
+    factors = far[KEY]["enlarged"]
+    stored = replace(result, summary=far, calibration=enlarged(result.solved, factors))
+    again = cross_validated(stored, given, found)
+    for key in ("verdict", "reasons", "cameras", "scale", "refined"):
+        assert again[key] == result.summary[key]
+    assert sorted(again["warnings"]) == sorted(result.summary["warnings"])
 
 
 def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
@@ -212,6 +292,7 @@ def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
     (out / "summary.json").write_text(json.dumps(bare))
     shown = CliRunner().invoke(app, ["check", str(out), "--halves"])
     assert shown.exit_code == 0, shown.output
+    assert shown.output.startswith("Verdict: fits.")
     numbers = check_halves(out)
     after = json.loads((out / "summary.json").read_text())
     assert after[KEY] == json.loads(json.dumps(numbers))

@@ -91,6 +91,14 @@ def verdict_of_correct_input(seed: int):
     return judged(given, refined.calibration, used)
 
 
+def test_what_no_test_could_have_contradicted_does_not_fit_but_is_doubtful():
+    """Two frames: no place in the image is seen often enough for what repeats there."""
+    simulated = simulated_dive(num_frames=2, num_points=600)
+    verdict = adjusted(simulated.scene, nominal_rig(sample_rig()), with_floor=True)
+    assert codes(verdict) == {"too_little_data": DOUBTFUL}
+    assert "2 frames" in verdict.reasons[0].text
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_a_correct_input_fits(seed):
     verdict = verdict_of_correct_input(seed)
@@ -273,6 +281,7 @@ FLOOR = NoiseFloor(
 TRIGGERS = {
     "above_noise_floor": ({"floor": FLOOR}, DOES_NOT_FIT),
     "not_converged": ({"converged": False}, DOUBTFUL),
+    "too_little_data": ({"floor": None}, DOUBTFUL),
     "distance_at_zero": ({"below_zero_z": 12.0}, DOUBTFUL),
     "few_frames": ({"used": Used(num_frames=30, num_registered=9)}, DOUBTFUL),
     "few_observations": (

@@ -17,12 +17,12 @@ from uwsfm.calibration.given_errors import given_reach
 from uwsfm.calibration.places import placed
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.calibration.scale import scale_slope
-from uwsfm.console import budget_table, housing_table, result_table
 from uwsfm.errors import InputError
 from uwsfm.export.files import SUMMARY
 from uwsfm.job_checks import require_effect
 from uwsfm.report.tables import estimates
 from uwsfm.report.words import deviation
+from uwsfm.result_tables import budget_table, housing_table, result_table
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +58,13 @@ def test_the_summary_has_both_deviations_as_they_are(dive_result, summary):
             * camera["azimuth_stddev_in_all_deg"],
         )
         assert turned == pytest.approx(total.normal_stddev_deg, rel=1e-6)
+        for parts, angle in (
+            (camera["tilt_xy_stddev_deg"], own.normal_stddev_deg),
+            (camera["tilt_xy_stddev_in_all_deg"], total.normal_stddev_deg),
+        ):
+            # Two slopes of a normal 2 degrees off the axis: all but 0.1 % of its angle.
+            assert np.hypot(*parts) == pytest.approx(angle, rel=3e-3)
+            assert max(parts) < 0.95 * angle
     scale = summary["scale"]
     assert scale["relative_stddev"] == covariance.scale_stddev
     assert scale["relative_stddev_in_all"] == covariance.in_all.scale_stddev

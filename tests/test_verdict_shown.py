@@ -2,7 +2,10 @@
 
 import io
 import json
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +14,13 @@ from rich.console import Console
 from sfm_scenes import model_of, simulated_dive
 from typer.testing import CliRunner
 
-from uwsfm.batch import Outcome
+from uwsfm.batch import Outcome, cause_of
 from uwsfm.cli import app
 from uwsfm.cli_results import NO_FIT
-from uwsfm.console import batch_table
 from uwsfm.export.files import HOUSING, SUMMARY, export_colmap
 from uwsfm.export.verdict_summary import verdict_line, with_verdict
 from uwsfm.report.gather import PAGE
+from uwsfm.result_tables import batch_table
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.trust.reason import DOUBTFUL, reason
@@ -147,6 +150,44 @@ def test_a_doubtful_result_has_weaker_words(dive_result):
     assert verdict_line(summary) == "Verdict: doubtful, for one reason."
 
 
+def test_check_ends_as_the_verdict_does(wrong_dive):
+    _, out = wrong_dive
+    found = CliRunner().invoke(app, ["check", str(out)])
+    assert found.exit_code == NO_FIT, found.output
+    assert found.output.startswith("Verdict: does not fit")
+
+
+def test_every_rms_says_of_what_it_is(wrong_dive):
+    found, _ = wrong_dive
+    text = " ".join(found.stdout.split())
+    assert "RMS error of these observations" in text
+    assert "best 90 % of a sample of the observations" in text
+
+
+def test_batch_shows_the_named_cause_or_else_the_first_reason():
+    reasons = [{"text": "The residuals repeat."}]
+    cause = [{"text": "Probably the baseline is in another unit."}]
+    assert cause_of({"explanations": cause, "reasons": reasons}) == cause[0]["text"]
+    assert cause_of({"explanations": [], "reasons": reasons}) == reasons[0]["text"]
+    assert cause_of({"explanations": [], "reasons": []}) is None
+
+
+def test_a_pipe_is_wide_enough_and_a_terminal_as_wide_as_it_is():
+    script = "from uwsfm.console import console; print(console.width)"
+    for columns, expected in ((None, "200"), ("80", "80")):
+        environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"}
+        if columns is not None:
+            environment["COLUMNS"] = columns
+        found = subprocess.run(
+            [sys.executable, "-c", script],
+            capture_output=True,
+            text=True,
+            env=environment,
+            check=True,
+        )
+        assert found.stdout.strip() == expected
+
+
 def test_batch_shows_the_verdict_of_each_dive():
     outcomes = [
         Outcome(name="bow", reason=None, seconds=60.0, verdict="fits"),
@@ -155,7 +196,7 @@ def test_batch_shows_the_verdict_of_each_dive():
             reason=None,
             seconds=60.0,
             verdict="does not fit",
-            verdict_reason="Camera left: the port came out at 431 mm.",
+            cause="Camera left: the port came out at 431 mm.",
         ),
         Outcome(name="keel", reason="no images", seconds=1.0),
     ]

@@ -161,12 +161,13 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
             num_registered_frames=summary["num_registered_frames"],
             rms_px=summary["reprojection_rms_px"]["after"],
             verdict=result.verdict.verdict,
-            cause=_cause(summary),
+            cause=cause_of(summary),
         )
     return Outcome(name=dive.name, reason=reason, seconds=time.monotonic() - began)
 
 
-def _cause(summary: Mapping[str, Any]) -> str | None:
+def cause_of(summary: Mapping[str, Any]) -> str | None:
+    """What a summary names as the cause, or else the first reason of its verdict."""
     causes = [*summary["explanations"], *summary["reasons"]]
     return causes[0]["text"] if causes else None
 

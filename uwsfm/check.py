@@ -8,12 +8,9 @@ from typing import Any
 
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
-from uwsfm.export.calibration_file import RUN_AGAIN
-from uwsfm.export.files import RIG_GIVEN, SPARSE
+from uwsfm.export.files import SPARSE
 from uwsfm.export.summary import write_json
-from uwsfm.result_folder import open_result
-from uwsfm.rig import Rig
-from uwsfm.rig_file import load_rig
+from uwsfm.result_folder import given_rig, open_result
 from uwsfm.trust.diagnosis import Explanation, diagnose, options_of
 
 CHECK = "check.json"
@@ -70,17 +67,3 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
     )
     write_json(found.to_json(), result.folder / CHECK)
     return found
-
-
-def given_rig(folder: Path) -> Rig:
-    """The rig as it was given for a result.
-
-    Raises:
-        InputError: the folder does not have it.
-    """
-    path = folder / RIG_GIVEN
-    if not path.is_file():
-        raise InputError(
-            f"{path} is missing: the rig as given is not known; {RUN_AGAIN}"
-        )
-    return load_rig(path)

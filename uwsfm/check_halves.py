@@ -18,14 +18,16 @@ from uwsfm.export.summary import (
     scale_summary,
     write_json,
 )
-from uwsfm.export.verdict_summary import reasons_summary, toned
+from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.judgement import housing_warnings
 from uwsfm.report.files import write_report
 from uwsfm.report.gather import PAGE
-from uwsfm.result_folder import Result, open_result
+from uwsfm.result_folder import Result, given_rig, open_result
+from uwsfm.rig import Rig
+from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate
-from uwsfm.trust.halves_reason import CODE, halves_reasons
-from uwsfm.trust.verdict import DOES_NOT_FIT, FITS
+from uwsfm.trust.halves_reason import halves_reasons
+from uwsfm.trust.verdict import judged, with_reasons
 
 
 def check_halves(out: str | Path) -> dict[str, Any]:
@@ -46,13 +48,14 @@ def check_halves(out: str | Path) -> dict[str, Any]:
         UwsfmError: there are too few frames, or no halves could be adjusted.
     """
     result = open_result(out)
-    if "verdict" not in result.summary:
+    if "goodness" not in result.summary:
         raise InputError(
             f"{result.folder / SUMMARY} has no verdict: an earlier version of uwsfm "
             f"made this result; {RUN_AGAIN}"
         )
-    found = cross_validate(result.model.rig, result.solved)
-    summary = cross_validated(result, found)
+    given = given_rig(result.folder)
+    found = cross_validate(given, result.solved)
+    summary = cross_validated(result, given, found)
     write_json(summary, result.folder / SUMMARY)
     if (result.folder / PAGE).is_file():
         write_report(result.folder)
@@ -60,19 +63,23 @@ def check_halves(out: str | Path) -> dict[str, Any]:
     return numbers
 
 
-def cross_validated(result: Result, found: CrossValidation) -> dict[str, Any]:
+def cross_validated(
+    result: Result, given: Rig, found: CrossValidation
+) -> dict[str, Any]:
     """The summary of a result with a cross-validation, in the place of an earlier one.
 
     Args:
         result: as it is stored.
+        given: its rig as it was given.
         found: of its frames.
     """
     rig, summary = result.model.rig, result.summary
     now, budget = enlarged(result.solved, found.enlarged), error_budget(result.solved)
-    judged = {**summary, **_rejudged(summary, found)}
+    used = Used(**summary["goodness"]["used"])
+    verdict = with_reasons(judged(given, now, used), halves_reasons(found))
     # Notes are sentences with numbers in them: those of before go, all others stay.
     old = housing_warnings(rig, result.calibration, budget, summary["verdict"])
-    new = housing_warnings(rig, now, budget, judged["verdict"])
+    new = housing_warnings(rig, now, budget, verdict.verdict)
     cameras = zip(housing_summary(rig, now), summary["cameras"], strict=True)
     numbers = {
         "cameras": [{**fresh, **_of_the_lens(stored)} for fresh, stored in cameras],
@@ -81,18 +88,9 @@ def cross_validated(result: Result, found: CrossValidation) -> dict[str, Any]:
         "warnings": [text for text in summary["warnings"] if text not in old] + new,
         KEY: halves_numbers(found),
     }
-    return toned({**judged, **numbers})
+    return with_verdict(verdict, {**summary, **numbers})
 
 
 def _of_the_lens(camera: Mapping[str, Any]) -> dict[str, Any]:
     """How well a lens was converted, which only its first rig file showed."""
     return {key: camera[key] for key in camera if key.startswith("lens_conversion")}
-
-
-def _rejudged(summary: Mapping[str, Any], found: CrossValidation) -> dict[str, Any]:
-    """Verdict and reasons of a summary, with what the halves say."""
-    reasons = [reason for reason in summary["reasons"] if reason["code"] != CODE]
-    reasons += reasons_summary(halves_reasons(found))
-    words = [reason["severity"] for reason in reasons]
-    word = DOES_NOT_FIT if DOES_NOT_FIT in words else words[0] if words else FITS
-    return {"verdict": word, "reasons": reasons}

@@ -235,8 +235,8 @@ def calibrate(
         Literal["virtual", "paper", "pairs"],
         typer.Option(
             help="How the adjustment starts. virtual: from pinholes fitted to the "
-            "ports. paper: from pinholes of 1.333 f with radial distortion, adjusted as "
-            "in the paper. pairs: from single stereo pairs, which determine normals "
+            "ports. paper: from pinholes of 1.333 f with radial distortion, adjusted "
+            "as in the paper. pairs: from single stereo pairs, which determine normals "
             "only."
         ),
     ] = "virtual",

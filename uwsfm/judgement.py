@@ -75,14 +75,14 @@ def judged_result(
     """
     progress("judging the fit", 0, None)
     solved, budget = with_budget(calibration)
-    verdict = judged(rig, solved, used)
     halves = cross_validate_if_cheap(rig, solved) if in_halves else None
+    shown = enlarged(solved, {} if halves is None else halves.enlarged)
     return Judgement(
         solved=solved,
-        calibration=enlarged(solved, {} if halves is None else halves.enlarged),
+        calibration=shown,
         budget=budget,
         halves=halves,
-        verdict=with_reasons(verdict, halves_reasons(halves)),
+        verdict=with_reasons(judged(rig, shown, used), halves_reasons(halves)),
     )
 
 

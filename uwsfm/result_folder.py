@@ -17,8 +17,17 @@ from uwsfm.export.calibration_file import (
     read_calibration,
     write_calibration,
 )
-from uwsfm.export.files import HOUSING, SPARSE, SUMMARY, read_model, read_summary
+from uwsfm.export.files import (
+    HOUSING,
+    RIG_GIVEN,
+    SPARSE,
+    SUMMARY,
+    read_model,
+    read_summary,
+)
 from uwsfm.export.halves_summary import KEY
+from uwsfm.rig import Rig
+from uwsfm.rig_file import load_rig
 
 DENSE_CLOUD = "dense/cloud.ply"
 """Where `uwsfm dense` leaves its cloud."""
@@ -96,6 +105,20 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
         images=_image_folder(model, images, summary.get("images")),
         fingerprint=mark,
     )
+
+
+def given_rig(folder: Path) -> Rig:
+    """The rig as it was given for a result.
+
+    Raises:
+        InputError: the folder does not have it.
+    """
+    path = folder / RIG_GIVEN
+    if not path.is_file():
+        raise InputError(
+            f"{path} is missing: the rig as given is not known; {RUN_AGAIN}"
+        )
+    return load_rig(path)
 
 
 def find_dense_cloud(folder: Path) -> Path | None:

@@ -134,7 +134,7 @@ def checked_folder(value: str) -> str:
 
 
 ACCURACIES: dict[str, tuple[float, str]] = {
-    "focal": (0.1, "a share of the focal length: 0.001 is 0.1 %"),
+    "focal": (0.1, "as a share of the focal length: 0.001 is 0.1 %"),
     "principal_point_px": (500.0, "in pixels"),
     "thickness_m": (0.02, "in metres: 0.0005 is half a millimetre"),
     "radius_m": (0.05, "in metres: 0.001 is a millimetre"),

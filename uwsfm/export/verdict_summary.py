@@ -2,13 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from uwsfm.calibration.length_verdicts import ARBITRARY
-from uwsfm.trust.reason import Reason
 from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict
 
 CONFIDENT = ("determined", "weakly determined")
@@ -31,31 +30,7 @@ def shown_word(word: str, verdict: str) -> str:
 def with_verdict(verdict: Verdict, summary: Mapping[str, Any]) -> dict[str, Any]:
     """A summary with the verdict, its reasons and numbers first, and its words toned
     down to it."""
-    first = {
-        "verdict": verdict.verdict,
-        "reasons": reasons_summary(verdict.reasons),
-        "goodness": plain(verdict.goodness),
-    }
-    rest = {key: value for key, value in summary.items() if key not in first}
-    return toned({**first, **rest})
-
-
-def reasons_summary(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
-    """Reasons of a verdict, for JSON."""
-    return [
-        {
-            "code": reason.code,
-            "text": reason.text,
-            "severity": reason.severity,
-            **{key: plain(value) for key, value in reason.numbers.items()},
-        }
-        for reason in reasons
-    ]
-
-
-def toned(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """A summary whose words say no more than its verdict does."""
-    word, scale = summary["verdict"], summary["scale"]
+    word, scale = verdict.verdict, summary["scale"]
     cameras = [
         {
             key: shown_word(value, word) if key.endswith("_verdict") else value
@@ -63,8 +38,22 @@ def toned(summary: Mapping[str, Any]) -> dict[str, Any]:
         }
         for camera in summary["cameras"]
     ]
+    first = {
+        "verdict": word,
+        "reasons": [
+            {
+                "code": reason.code,
+                "text": reason.text,
+                "severity": reason.severity,
+                **{key: plain(value) for key, value in reason.numbers.items()},
+            }
+            for reason in verdict.reasons
+        ],
+        "goodness": plain(verdict.goodness),
+    }
+    rest = {key: value for key, value in summary.items() if key not in first}
     shown = {**scale, "verdict": shown_word(scale["verdict"], word)}
-    return {**summary, "cameras": cameras, "scale": shown}
+    return {**first, **rest, "cameras": cameras, "scale": shown}
 
 
 def verdict_line(summary: Mapping[str, Any]) -> str:

@@ -3,7 +3,6 @@
 from uwsfm.trust.halves import CrossValidation
 from uwsfm.trust.reason import DOUBTFUL, Reason, reason
 
-CODE = "halves_differ"
 FAR_APART = 3.0
 """Times the prediction, and significant. Up to it, deviations are enlarged and that is
 all: a real rig in a tank has 1.3 to 2.1, as its lens fits badly; a port that was
@@ -36,4 +35,4 @@ def halves_reasons(found: CrossValidation | None) -> list[Reason]:
         "changed during the dive (a lens, a port, the placement of the cameras), or "
         "the model does not fit all frames alike."
     )
-    return [reason(CODE, text, DOUBTFUL, ratio=far[worst])]
+    return [reason("halves_differ", text, DOUBTFUL, ratio=far[worst])]
