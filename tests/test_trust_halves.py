@@ -274,7 +274,8 @@ def test_halves_change_verdict_words_and_notes_of_a_stored_result(dive_result):
         assert new["distance_stddev_m"] == pytest.approx(50.0 * own)
         assert new["distance_verdict"] != "determined"
     added = set(far["warnings"]) - set(result.summary["warnings"])
-    assert any("port distance" in note for note in added)
+    assert any("port distances by 50.0 times" in note for note in added)
+    assert any("port distances of left and right, moved" in note for note in added)
     factors = far[KEY]["enlarged"]
     stored = replace(result, summary=far, calibration=enlarged(result.solved, factors))
     again = cross_validated(stored, given, found)

@@ -16,7 +16,7 @@ from uwsfm.models.port import NoPort
 from uwsfm.rig import Rig
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate_if_cheap
-from uwsfm.trust.halves_reason import halves_reasons
+from uwsfm.trust.halves_reason import enlarged_notes, halves_reasons
 from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict, judged, with_reasons
 
 
@@ -92,7 +92,7 @@ def housing_warnings(
     budget: Sequence[BudgetRow] = (),
     verdict: str = FITS,
 ) -> list[str]:
-    """What is not determined of the housings, one sentence each.
+    """What is not determined or less well known of the housings, one sentence each.
 
     Of a result that does not fit nothing is: more frames would not help it.
     """
@@ -100,6 +100,7 @@ def housing_warnings(
     warnings: list[str] = []
     if verdict != DOES_NOT_FIT:
         warnings += verdicts(calibration, names, budget)
+    warnings += enlarged_notes(calibration.covariance.enlarged)
     bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
     if bare:
         warnings.append(

@@ -52,7 +52,7 @@ def verdict_of(summary: dict[str, Any]) -> Conclusions:
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
         fit=f"{registered} of {frames} frames are registered, with {points} points "
-        f"seen in {count} observations. The adjustment brought the true reprojection "
+        f"seen in {count} observations. The adjustment brought their true reprojection "
         f"error from {rms['before']:.3g} to {rms['after']:.3g} px RMS.",
         ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
         open=tuple(_sentence(text) for text in summary["warnings"]),

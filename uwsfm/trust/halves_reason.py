@@ -1,5 +1,7 @@
 """Halves of the frames that differ far, as a reason of a verdict."""
 
+from collections.abc import Mapping
+
 from uwsfm.trust.halves import CrossValidation
 from uwsfm.trust.reason import DOUBTFUL, Reason, reason
 
@@ -20,6 +22,20 @@ NAMES = {
     "scale": "scale",
 }
 """Groups of numbers that halves are compared by, for people."""
+
+
+def enlarged_notes(factors: Mapping[str, float]) -> list[str]:
+    """Which standard deviations were enlarged, and by how much, one sentence each.
+
+    Args:
+        factors: by group, as of `uwsfm.calibration.problem.Covariance.enlarged`.
+    """
+    return [
+        f"halves of the frames differ in their {NAMES[group]} by {factor:.1f} times "
+        "what their standard deviations predict; those from the images are enlarged "
+        "by as much"
+        for group, factor in factors.items()
+    ]
 
 
 def halves_reasons(found: CrossValidation | None) -> list[Reason]:
