@@ -16,7 +16,7 @@ from uwsfm.simulate.rigs import nominal_rig, paper_rig, sample_rig, tilted_norma
 from uwsfm.simulate.trajectories import lawn_mower, rich_motion, straight_strip
 from uwsfm.trust import free_lens as free_lens_module
 from uwsfm.trust.given import Departure
-from uwsfm.trust.goodness import Used
+from uwsfm.trust.goodness import Part, Used
 from uwsfm.trust.verdict import (
     DOES_NOT_FIT,
     DOUBTFUL,
@@ -281,7 +281,10 @@ FLOOR = NoiseFloor(
 TRIGGERS = {
     "above_noise_floor": ({"floor": FLOOR}, DOES_NOT_FIT),
     "not_converged": ({"converged": False}, DOUBTFUL),
-    "too_little_data": ({"floor": None}, DOUBTFUL),
+    "too_little_data": (
+        {"parts": (Part(by="place", px=float("nan"), p_value=float("nan")),)},
+        DOUBTFUL,
+    ),
     "distance_at_zero": ({"below_zero_z": 12.0}, DOUBTFUL),
     "few_frames": ({"used": Used(num_frames=30, num_registered=9)}, DOUBTFUL),
     "few_observations": (

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 from sfm_scenes import model_of, simulated_dive
+from typer import Exit
 from typer.testing import CliRunner
 
 from uwsfm.batch import Outcome, cause_of
 from uwsfm.cli import app
-from uwsfm.cli_results import NO_FIT
+from uwsfm.cli_results import NO_FIT, finish
 from uwsfm.export.files import HOUSING, SUMMARY, export_colmap
 from uwsfm.export.verdict_summary import verdict_line, with_verdict
 from uwsfm.report.gather import PAGE
@@ -150,11 +151,22 @@ def test_a_doubtful_result_has_weaker_words(dive_result):
     assert verdict_line(summary) == "Verdict: doubtful, for one reason."
 
 
+@pytest.mark.slow
 def test_check_ends_as_the_verdict_does(wrong_dive):
+    """Every mistake is tried before it ends."""
     _, out = wrong_dive
     found = CliRunner().invoke(app, ["check", str(out)])
     assert found.exit_code == NO_FIT, found.output
-    assert found.output.startswith("Verdict: does not fit")
+    assert found.stdout.startswith("Verdict: does not fit")
+
+
+def test_every_job_ends_as_its_verdict_does(capsys):
+    for word in ("fits", "doubtful"):
+        finish({"verdict": word}, "results in out")
+    with pytest.raises(Exit) as ended:
+        finish({"verdict": "does not fit"}, "results in out")
+    assert ended.value.exit_code == NO_FIT
+    assert capsys.readouterr().out == 3 * "results in out\n"
 
 
 def test_every_rms_says_of_what_it_is(wrong_dive):

@@ -297,20 +297,18 @@ def _used(used: Used) -> list[Reason]:
 
 
 def _too_little(goodness: Goodness) -> list[Reason]:
-    """Tests that no wrong input could have failed, as they had too little to go by."""
-    missing = []
-    if goodness.floor is None:
-        missing.append("no two images share enough points for their noise floor")
-    if all(math.isnan(p.p_value) for p in goodness.parts if p.by == "place"):
-        missing.append(
-            "too few images see the same part of the picture for what repeats there"
-        )
-    if not missing:
+    """A wrong lens could not have shown: no part of the picture is seen often enough.
+
+    The noise floor is no condition: matches of small sets are often too few for it, and
+    what repeats in the image finds the same mistakes.
+    """
+    if not all(math.isnan(p.p_value) for p in goodness.parts if p.by == "place"):
         return []
     frames = goodness.used.num_registered
     text = (
-        "There is too little data to tell whether the model fits: "
-        f"{' and '.join(missing)} ({frames} frames). Give more frames that overlap."
+        "There is too little data to tell whether the model fits: in "
+        f"{frames} frames, too few images see points in the same part of the picture "
+        "for errors that repeat there to show. Give more frames."
     )
     return [reason("too_little_data", text, DOUBTFUL, frames=frames)]
 
