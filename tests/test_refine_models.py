@@ -246,6 +246,6 @@ def test_the_command_line_refines_a_model(dive, tmp_path, capsys, monkeypatch):
         cli.main()
     assert ended.value.code in (0, None)
     shown = capsys.readouterr().out
-    assert "of the COLMAP model, same" in shown and "water index" in shown
+    assert "with the COLMAP model" in shown and "water index" in shown
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["refined"][0]["name"] == "water index"
