@@ -117,7 +117,13 @@ def refine_scene(
     last, keep = solve(scene, keep)
     solves = last.summary.solves
     for number in range(MAX_ROUNDS):
-        scene = agreeing_points(_with_result(scene, last), calibrated, MAX_ERROR_PX)
+        trusted = np.zeros_like(keep)
+        trusted[np.nonzero(keep)[0][last.inliers]] = True
+        # Points that the start was too far off for get another chance, as a whole.
+        lost = np.bincount(scene.point_idx[trusted], minlength=scene.num_points) < 2
+        trusted |= lost[scene.point_idx] & calibrated
+        scene = _with_result(scene, last)
+        scene = agreeing_points(scene, trusted, MAX_START_ERROR_PX)
         agreeing = good_observations(scene, MAX_ERROR_PX) & calibrated
         num_used = np.count_nonzero(last.inliers)
         if number and np.count_nonzero(agreeing) < WORTH_ANOTHER * num_used:

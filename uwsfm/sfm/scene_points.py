@@ -21,6 +21,10 @@ from uwsfm.sfm.mapping.triangulation import Views
 
 MIN_ANGLE_DEG = 1.5
 """A point nearer to a camera than this many degrees of parallax has no depth."""
+MOST = 0.6
+"""Share of a track that agrees on its point if the rest is wrong: two of three. Where a
+camera is late, or turned, each half of a track agrees with itself: to take the better
+half would hide what is wrong with the model."""
 WIDER, LEAST_RANGE = 2.0, 1.25
 """Distances of points that three images agree on reach from some share of their image's
 median to some multiple of it. Points of two may be so much farther from it, in
@@ -75,7 +79,7 @@ def agreeing_points(
 
     Returns:
         As of `retriangulated` for tracks whose observations all agree, and for those
-        in which no two do.
+        in which `MOST` of them do not.
     """
     scene = retriangulated(scene, trusted)
     error = np.linalg.norm(scene.residuals(), axis=1)
@@ -91,10 +95,11 @@ def agreeing_points(
     found = triangulate(views, start, rows, max_error_px, np.radians(MIN_ANGLE_DEG))
     first = np.full(len(tracks), len(found.points))  # the best of a track comes first
     seen = found.point_of >= 0
+    sizes = np.bincount(found.point_of[seen], minlength=len(found.points))
     np.minimum.at(first, of_track[seen], found.point_of[seen])
-    there = first < len(found.points)
+    agree = np.append(sizes, 0)[first] >= MOST * np.bincount(of_track)
     points = scene.points.copy()
-    points[tracks[there]] = found.points[first[there]]
+    points[tracks[agree]] = found.points[first[agree]]
     return replace(scene, points=points)
 
 
