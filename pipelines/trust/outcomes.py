@@ -30,7 +30,8 @@ from uwsfm.rig_file import dump_rig, load_rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.fixed_rig import fix_rig
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.refine import Refined, refine_scene, retriangulated
+from uwsfm.sfm.refine import Refined, refine_scene
+from uwsfm.sfm.scene_points import retriangulated
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate.rigs import known_cam_from_rig

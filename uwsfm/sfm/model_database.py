@@ -28,7 +28,8 @@ from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.mapping.incremental import MIN_IMAGES
 from uwsfm.sfm.mapping.registration import Ranking, register_next
 from uwsfm.sfm.model_start import Tracks
-from uwsfm.sfm.refine import MAX_ERROR_PX, MIN_ANGLE_DEG, Refined
+from uwsfm.sfm.refine import MAX_ERROR_PX, Refined
+from uwsfm.sfm.scene_points import MIN_ANGLE_DEG
 
 SAME_PIXEL = 0.01
 """Databases hold pixels in single precision."""

@@ -26,9 +26,9 @@ from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.tracks import match_gaps_px
-from uwsfm.sfm.mapping.triangulation import Views
 from uwsfm.sfm.relative_pose import MEDIAN_GAP, estimate_relative_pose
 from uwsfm.sfm.relative_pose_options import RelativePoseOptions
+from uwsfm.sfm.scene_points import views_of
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import LevenbergMarquardtOptions, minimize
 from uwsfm.solver.state import State
@@ -213,23 +213,7 @@ def matches_of_tracks(scene: Scene) -> IndexArray:
 
 def gaps_px(scene: Scene, matches: IndexArray) -> Array:
     """By how many pixels the water rays of matches (M, 2) miss each other, (M,)."""
-    num_cameras = len(scene.cameras)
-    frame, camera = np.divmod(
-        np.arange(scene.num_frames * num_cameras, dtype=np.int64), num_cameras
-    )
-    poses = rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world[frame])
-    origins, dirs = scene.water_rays()
-    views = Views(
-        cam_from_world=rigid3.matrix_rows(poses),
-        camera=camera,
-        lenses=np.array([c.lens for c in scene.cameras]),
-        ports=np.array([c.port.row for c in scene.cameras]),
-        image=scene.frame_idx * num_cameras + scene.camera_idx,
-        xy=scene.xy,
-        origins=origins,
-        dirs=dirs,
-    )
-    return match_gaps_px(views, np.ascontiguousarray(matches))
+    return match_gaps_px(views_of(scene), np.ascontiguousarray(matches))
 
 
 def _pairs(

@@ -13,13 +13,10 @@ from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.scaling import scaled, start_scale
 from uwsfm.errors import UwsfmError
-from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
+from uwsfm.sfm.scene_points import agreeing_points, good_observations
 from uwsfm.sfm.second_start import better_start
-
-# A point nearer to a camera than this many degrees of parallax has no depth.
-MIN_ANGLE_DEG = 1.5
 
 # The start's ports are guesses: an error this large is a wrong match all the same.
 MAX_START_ERROR_PX = 50.0
@@ -90,7 +87,8 @@ def refine_scene(
     given = lengths or Lengths()
     calibrated = within_valid_radius(scene, rig)
     calibrated[given.clicked] = True
-    start = _at_scale(retriangulated(scene, calibrated), given, calibrated)
+    start = agreeing_points(scene, calibrated, MAX_START_ERROR_PX)
+    start = _at_scale(start, given, calibrated)
     solver = _Solver(
         known=known or start,
         lengths=lengths,
@@ -134,17 +132,17 @@ class _Solver:
         keep = good_observations(scene, MAX_START_ERROR_PX) & self.calibrated
         last, keep = self._solved(scene, keep)
         solves = last.summary.solves
-        for _ in range(MAX_ROUNDS):
-            num_before = np.count_nonzero(last.inliers)
-            scene = retriangulated(
-                _with_result(scene, last), self._trusted(scene, last, keep)
-            )
-            keep = good_observations(scene, MAX_ERROR_PX) & self.calibrated
-            check_clicks(self.lengths or Lengths(), scene)
-            last, keep = self._solved(scene, keep)
-            solves += last.summary.solves
-            if np.count_nonzero(last.inliers) < WORTH_ANOTHER * num_before:
+        for number in range(MAX_ROUNDS):
+            trusted = self._trusted(scene, last, keep)
+            scene = _with_result(scene, last)
+            scene = agreeing_points(scene, trusted, MAX_START_ERROR_PX)
+            agreeing = good_observations(scene, MAX_ERROR_PX) & self.calibrated
+            num_used = np.count_nonzero(last.inliers)
+            if number and np.count_nonzero(agreeing) < WORTH_ANOTHER * num_used:
                 break
+            check_clicks(self.lengths or Lengths(), scene)
+            last, keep = self._solved(scene, agreeing)
+            solves += last.summary.solves
         return replace(last, summary=replace(last.summary, solves=solves)), keep
 
     def _trusted(
@@ -220,12 +218,12 @@ def _in_frames(bars: Scene, frames: IndexArray) -> Scene:
     )
 
 
-def _at_scale(scene: Scene, lengths: Lengths, trusted: NDArray[np.bool_]) -> Scene:
+def _at_scale(scene: Scene, lengths: Lengths, calibrated: NDArray[np.bool_]) -> Scene:
     """The scene of one camera, at the scale of its lengths."""
     if len(scene.cameras) > 1 or not lengths.give_scale:
         return scene
     larger = scaled(scene, start_scale(scene, lengths))
-    return retriangulated(larger, trusted)
+    return agreeing_points(larger, calibrated, MAX_START_ERROR_PX)
 
 
 def _with_result(scene: Scene, result: CalibrationResult) -> Scene:
@@ -245,32 +243,6 @@ def within_valid_radius(scene: Scene, rig: Rig) -> NDArray[np.bool_]:
         rows = scene.camera_idx == index
         covered[rows] = camera.covers(scene.xy[rows])
     return covered
-
-
-def retriangulated(scene: Scene, trusted: NDArray[np.bool_]) -> Scene:
-    """The scene with its points intersected from the water rays.
-
-    Args:
-        scene: its points are not used.
-        trusted: (N,) mask of the observations that shape the points.
-    """
-    origins, dirs = scene.water_rays()
-    dirs = np.where(trusted[:, None], dirs, np.nan)
-    points = triangulate_tracks(origins, dirs, scene.point_idx, scene.num_points)
-    return replace(scene, points=points)
-
-
-def good_observations(scene: Scene, max_error_px: float) -> NDArray[np.bool_]:
-    """Mask (N,) of observations near their points, whose points have depth."""
-    error = np.linalg.norm(scene.residuals(), axis=1)
-    near = finite_rows(scene.points)[scene.point_idx] & (error <= max_error_px)
-    _, dirs = scene.water_rays()
-    near &= finite_rows(dirs)
-    angles = np.zeros(scene.num_points)
-    angles[:] = max_ray_angles(dirs[near], scene.point_idx[near], scene.num_points)
-    near &= angles[scene.point_idx] >= np.radians(MIN_ANGLE_DEG)
-    counts = np.bincount(scene.point_idx[near], minlength=scene.num_points)
-    return near & (counts[scene.point_idx] >= 2)
 
 
 def _require(keep: NDArray[np.bool_], scene: Scene) -> NDArray[np.bool_]:

@@ -24,7 +24,8 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.refine import retriangulated, rig_options
+from uwsfm.sfm.refine import rig_options
+from uwsfm.sfm.scene_points import retriangulated
 
 TRIMMED = 0.9
 """Share of the observations that an RMS is of, the best ones: wrong matches must not
