@@ -21,8 +21,10 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.solver.threads import limited
 from uwsfm.trust.midway import (
+    ZoomTrial,
     coarse_firsts,
     fine_firsts,
+    nearby_zooms,
     shifts_since,
     zoom_trial,
 )
@@ -149,25 +151,42 @@ def diagnose(
         *shifts_since(rig, part, base.fit, names),
     ]
     tried = experiments.all(todo, part)
-    firsts = coarse_firsts(part.num_frames)
-    zoomed = [zoom_trial(rig, first, names[first]) for first in firsts]
-    coarse = experiments.all(zoomed, part)
-    if coarse:
-        best = min(range(len(coarse)), key=lambda k: coarse[k].total)
-        near = fine_firsts(coarse[best].trial.first, part.num_frames)
-        coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
-    tried += _more_than_focal(coarse, tried)
+    tried += _zooms(experiments, rig, part, names, (base, *tried))
     if tried:
         best_fit = min(tried, key=lambda one: one.total).fit
         base = experiments.again(base, best_fit, part)
     return explanations(base, tried)
 
 
-def _more_than_focal(zoomed: list[Tried], tried: Sequence[Tried]) -> list[Tried]:
-    """Changes of zoom that explain clearly more than one wrong focal length does."""
-    focal = [one.total for one in tried if one.trial.code == "focal"]
-    limit = min(focal, default=math.inf) - CLEAR
-    return [one for one in zoomed if one.total <= limit]
+def _zooms(
+    experiments: _Experiments,
+    rig: Rig,
+    part: Scene,
+    names: Sequence[str],
+    tried: Sequence[Tried],
+) -> list[Tried]:
+    """The likeliest change of zoom, if it explains clearly more than one focal length.
+
+    Args:
+        experiments: Runs the trials.
+        rig: As given.
+        part: The observations.
+        names: Of its frames.
+        tried: The rig as given, and the other trials.
+    """
+    firsts = coarse_firsts(part.num_frames)
+    found = experiments.all([zoom_trial(rig, f, names[f]) for f in firsts], part)
+    if not found:
+        return []
+    best = min(found, key=lambda one: one.total)
+    near = fine_firsts(best.trial.first, part.num_frames)
+    found += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
+    best = min(found, key=lambda one: one.total)
+    assert isinstance(best.trial, ZoomTrial)
+    found += experiments.all(nearby_zooms(best.trial, best.fit), part)
+    best = min(found, key=lambda one: one.total)
+    common = [one.total for one in tried if one.trial.code in ("", "focal")]
+    return [best] if best.total <= min(common) - CLEAR else []
 
 
 class _Experiments:
