@@ -111,11 +111,11 @@ def options_of(calibration: CalibrationResult) -> dict[str, Any]:
     pixels.
     """
     given, plain = calibration.options, CalibrateOptions()
-    pairs = ((name, getattr(given, name)) for name in _KEPT)
+    pairs = ((name, getattr(given, name)) for name in KEPT)
     return {name: value for name, value in pairs if value != getattr(plain, name)}
 
 
-_KEPT = (
+KEPT = (
     *PRIORS,
     "refine_focal",
     "refine_principal_point",
@@ -123,6 +123,7 @@ _KEPT = (
     "refine_water_index",
     "separate_water_index",
 )
+"""Fields of `CalibrateOptions` that a trial takes over from the result."""
 
 
 def diagnose(
