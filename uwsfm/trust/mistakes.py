@@ -127,9 +127,6 @@ FOCAL = {"refine_focal": True, "focal_stddev": 0.5}
 CENTER = {"refine_principal_point": True, "principal_point_stddev_px": 200.0}
 DISTORTION_STDDEV = 0.5
 """Priors that hold nothing but what no image shows."""
-FREE_DISTORTION = 3.0
-"""Handicap of all coefficients of a camera: whatever is wrong with them is undone by
-these, so an order or a sign that does as well must come out first, alone."""
 
 
 def _free_lenses(rig: Rig) -> Iterator[Trial]:
@@ -172,7 +169,7 @@ def _free_distortions(rig: Rig) -> Iterator[Trial]:
                 "refine_distortion": tuple(c in which for c in every),
                 "distortion_stddev": DISTORTION_STDDEV,
             },
-            handicap=FREE_DISTORTION,
+            handicap=FREE * len(which),
             estimate=partial(_distortion_words, rig, which),
         )
 
