@@ -14,6 +14,7 @@ import numpy as np
 
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
@@ -42,6 +43,8 @@ MAX_BEHIND_M = 0.01
 MAX_MISFIT = 1e-3
 """Radians, median over all matches: half a pixel, noise and wrong matches included."""
 LOSS_PX = 3.0
+QUINTILE = 1.9
+"""Fourth quintile over median of |x| for normal x."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +53,19 @@ class MovedPorts:
 
     misfit: float
     """Median angle between rays and their epipolar plane, radians."""
+    typical: float
+    """`typical_angle` of the same, radians."""
     strain: float
     """How far the ports moved, in the standard deviations of `FREEDOM`, all together:
     root of the sum of squares."""
+
+
+def typical_angle(angles: Array) -> float:
+    """The larger of two estimates of the median size of angles (N,): itself, and by the
+    fourth quintile of normal ones. A mistake in less than half of the frames leaves the
+    median as it is. NaN counts as far off."""
+    sizes = np.nan_to_num(np.abs(angles), nan=np.pi)
+    return float(max(np.median(sizes), np.quantile(sizes, 0.8) / QUINTILE))
 
 
 def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
@@ -101,7 +114,10 @@ def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts 
     if np.any(ports[behind, 3] < -MAX_BEHIND_M):
         return None
     ports[behind, 3] = 0.0
-    found = replace(state, ports=ports).to_scene(scene)
+    try:
+        found = replace(state, ports=ports).to_scene(scene)
+    except InputError:  # a dome in front of its lens, a normal that points inwards
+        return None
     if not all(_possible(port) for port in found.ports):
         return None
     step, (first, second) = _step(pair), found.cameras
@@ -113,7 +129,9 @@ def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts 
         for before, after in zip(scene.ports, found.ports, strict=True)
     ]
     return MovedPorts(
-        misfit=float(np.median(angles)), strain=float(np.linalg.norm(moves))
+        misfit=float(np.median(angles)),
+        typical=typical_angle(angles),
+        strain=float(np.linalg.norm(moves)),
     )
 
 

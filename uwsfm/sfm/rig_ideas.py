@@ -20,7 +20,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.correction import Correction
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
 from uwsfm.sfm.lens_mistakes import FOCAL_FACTORS, focal_corrections
-from uwsfm.sfm.moved_ports import moved_ports
+from uwsfm.sfm.moved_ports import moved_ports, typical_angle
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
     corrected_pixels,
@@ -49,8 +49,8 @@ MAX_PHRASES = 3
 CLEAN_MISFIT = 1.5e-3
 """Radians: half a pixel of a small image. An explanation that leaves more, or needs a
 turn, is compared with others once more, with ports that move."""
-SHORTLIST = 12
-"""So many of the best are: a dome off its centre comes as far down as the fifth."""
+SHORTLIST = 24
+"""So many of the best are: a dome off its centre comes as far down as the twentieth."""
 RARER_ZOOM = 1.0
 """Strain of a zoom that changed: of many frames and factors one always fits a bit."""
 MIN_FRAMES, MAX_SPLITS, ZOOM_MATCHES = 2, 5, 200
@@ -73,7 +73,7 @@ class _Idea:
     """By how much more than usual cameras must turn, or ports move; inf if nothing
     makes them fit."""
     misfit: float
-    """Median angle between rays and their epipolar plane after that, radians."""
+    """`typical_angle` between rays and their epipolar plane after that, radians."""
 
     @property
     def phrase(self) -> str:
@@ -271,10 +271,12 @@ def _turned(correction: Correction, pair: PairMatches) -> _Idea:
     poses = np.stack([rigid3.IDENTITY, b_from_a])
     alone = replace(few, camera_a=0, camera_b=1)
     rotation = correct_rotations(cameras, poses, [alone])
+    turned = relative_pose(rotation.cam_from_rig, 0, 1)
+    rays = ray_pairs(*cameras, turned, few.xy_a, few.xy_b)
     return replace(
         idea,
         strain=float(rotation.turn_deg[1]) / SAME_TURN_DEG,
-        misfit=rotation.misfit_after,
+        misfit=typical_angle(rays.epipolar_angles()),
     )
 
 
@@ -287,4 +289,4 @@ def _moved(idea: _Idea) -> _Idea:
     moved = moved_ports(rig, rig.cam_from_rig, idea.pair)
     if moved is None:
         return replace(idea, strain=np.inf, misfit=np.inf)
-    return replace(idea, strain=moved.strain + rarer, misfit=moved.misfit)
+    return replace(idea, strain=moved.strain + rarer, misfit=moved.typical)
