@@ -13,6 +13,7 @@ from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry import rigid3
 from uwsfm.models.port import DomePort, NoPort
 from uwsfm.rig import Rig, camera_from_colmap
+from uwsfm.scene import Scene
 from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
@@ -219,6 +220,83 @@ def test_a_late_camera_is_named(rig, dive):
         check_rotation(rig, poses, turned(rig, poses, now), [now], later)
     assert error.value.codes == ("frames_shifted",)
     assert "the images of 'right' are 1 frame late" in str(error.value)
+
+
+def successive(scene: Scene, camera: int) -> PairMatches:
+    """Matches of a camera's images with its next ones."""
+    rows = []
+    for frame in range(scene.num_frames - 1):
+        now, then = (
+            np.flatnonzero((scene.camera_idx == camera) & (scene.frame_idx == f))
+            for f in (frame, frame + 1)
+        )
+        _, a, b = np.intersect1d(
+            scene.point_idx[now], scene.point_idx[then], return_indices=True
+        )
+        first = np.full((len(a), 1), float(frame))
+        rows.append(np.hstack([first, scene.xy[now[a]], scene.xy[then[b]]]))
+    table = np.concatenate(rows)
+    return PairMatches(
+        camera_a=camera,
+        camera_b=camera,
+        frame_idx=table[:, 0].astype(np.int64),
+        xy_a=table[:, 1:3],
+        xy_b=table[:, 3:5],
+    )
+
+
+@pytest.mark.parametrize("axis", [0, 1, None])
+def test_one_mirrored_camera_is_told_by_its_motion(rig, dive, pair, axis):
+    """Nothing matches across a mirror; where nothing matches for another reason, as in
+    murky water, the motions fit each other, and nobody is accused."""
+    scene, xy = dive.scene, dive.scene.xy.copy()
+    if axis is not None:
+        right = scene.camera_idx == 1
+        xy[right, axis] = (800.0, 600.0)[axis] - xy[right, axis]
+    scene = replace(scene, xy=xy)
+    few = pair.thinned(10)
+    with pytest.raises(InputError) as error:
+        check_rig(
+            rig,
+            poses_of(rig),
+            [few],
+            successive=lambda: [successive(scene, c) for c in range(2)],
+        )
+    codes = getattr(error.value, "codes", ())
+    assert codes == (() if axis is None else ("mirrored",))
+    if axis is not None:
+        assert ("left to right", "top to bottom")[axis] in str(error.value)
+
+
+def test_a_zoom_of_one_camera_midway_is_named(rig, pair):
+    """By 15 % from the fourth frame on: no single focal length fits all frames."""
+    center = rig.cameras[1].camera.params[2:4]
+    late = (pair.frame_idx >= 3)[:, None]
+    xy = np.where(late, center + 1.15 * (pair.xy_b - center), pair.xy_b)
+    text = refusal(rig, poses_of(rig), replace(pair, xy_b=xy))
+    assert "another one from the 4th frame on" in text
+
+
+def test_domes_off_their_centres_declared_flat_are_named(rig):
+    """A fisheye bends a central ray alike, but only a dome off its centre fits."""
+    centers = (0.002, -0.003, 0.008), (-0.003, 0.001, 0.012)
+    domes = tuple(
+        replace(item, port=DomePort(center=center, radius=0.05))
+        for item, center in zip(sample_rig().cameras, centers, strict=True)
+    )
+    pair = same_frame_matches(
+        simulated_dive(replace(sample_rig(), cameras=domes)).scene
+    )
+    text = refusal(rig, poses_of(rig), pair)
+    assert "is a dome, and not flat" in text and "fisheye" not in text
+
+
+def test_images_that_were_never_taken_together_are_named(rig, dive):
+    """Three frames late, and no neighbours to match: no placement of two cameras fits
+    all frames, though in each frame one does."""
+    scene = shifted(dive.scene, 1, 3, 0)
+    now = same_frame_matches(scene)
+    assert "were not taken together" in refusal(rig, poses_of(rig), now)
 
 
 def test_baseline_along_another_axis_is_refused(rig, pair):

@@ -121,6 +121,12 @@ def swapped(scene: Scene) -> Scene:
     return replace(scene, camera_idx=1 - scene.camera_idx)
 
 
+def turned(pose: np.ndarray) -> np.ndarray:
+    """By 0.6 degrees, about an axis that no port tilt stands for."""
+    turn = np.concatenate([np.radians([0.0, 0.0, 0.6]), np.zeros(3)])
+    return np.r_[rigid3.perturb(pose, turn)[:4], pose[4:]]
+
+
 IN_WATER = frozenset({"port_none", "dome_as_flat", "water_index"})
 """A concentric dome and a port in air bend no ray, as no port: one and the same."""
 
@@ -144,8 +150,11 @@ FAST = (
         seen=lambda scene: shifted(scene, 1, 1, 4),
         number="1 frame late from frame",
     ),
+    # No order and no sign: the coefficient itself is named, and what it was.
+    Mistake(code="distortion", rig=with_params(moved(4, 0.05)), number="for -0.00"),
 )
 SLOW = (
+    Mistake(code="rotation", rig=with_pose(turned, held=True), number="0.6"),
     Mistake(
         code="port_none",
         true=with_ports(lambda _: NoPort()),

@@ -293,6 +293,14 @@ TRIGGERS = {
     ),
     "known_length": ({"known_length_z": 6.0}, DOUBTFUL),
     "positions": ({"positions_scatter": 5.0, "positions_left_out": 0.0}, DOUBTFUL),
+    "port_distances": (
+        {
+            "departures": (
+                departure("distances_share", 1.0, 4.7, 0.74, given_stddev=0.65),
+            )
+        },
+        DOUBTFUL,
+    ),
     "port_tilt": (
         {"departures": (departure("tilt_deg", 0.0, 32.0, 0.5, given_stddev=5.0),)},
         DOES_NOT_FIT,

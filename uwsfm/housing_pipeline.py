@@ -40,13 +40,14 @@ from uwsfm.sfm.colmap_model import find_model
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.model_start import ModelStart, start_from_model
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.refine import refine_scene, rig_options, within_valid_radius
+from uwsfm.sfm.refine import rig_options, within_valid_radius
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
+from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
 
 Start = Literal["virtual", "paper", "pairs"]
@@ -200,8 +201,8 @@ class _Job:
             options = {"lengths": lengths, **self.options}
             # What is given is given of the rig file's ports, not of the map's.
             known = replace(scene, cameras=self.rig.refractive_cameras())
-            refined = refine_scene(
-                scene, self.rig, self.progress, known=known, **options
+            refined = refined_or_explained(
+                scene, self.rig, names, self.progress, known=known, **options
             )
             calibration, used = refined.calibration, used_of(refined, num_frames)
         judged = judged_result(

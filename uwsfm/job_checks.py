@@ -60,9 +60,13 @@ def require_effect(options: CalibrateOptions) -> None:
     for name, (what, wanted) in refined.items():
         if getattr(options, name) is not None and not np.any(wanted):
             raise InputError(f"{name} has no effect: {what} is not refined")
-    lens = options.refine_focal, options.refine_principal_point
+    lens = (
+        options.refine_focal,
+        options.refine_principal_point,
+        options.refine_distortion,
+    )
     correlated = options.given is not None and options.given.correlated_prior
-    if correlated and not any((*lens, options.refine_distortion)):
+    if correlated and not any(np.any(flags) for flags in lens):
         raise InputError(
             "accuracy.lens_prior: correlated has no effect: no lens parameter is "
             "refined; add --refine focal, say, or leave this key out"

@@ -51,11 +51,12 @@ from uwsfm.sfm.options import (
     StartOptions,
 )
 from uwsfm.sfm.perspective import StartArrays
-from uwsfm.sfm.refine import Refined, refine_scene, rig_options
+from uwsfm.sfm.refine import Refined, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
 from uwsfm.tasks import LOCAL, Workers
 from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
 
 
@@ -241,9 +242,10 @@ class _Job:
         scene, lengths = self.known.placed(self.rig, arrays.frame_names, scene)
         # What is known beforehand is known of the rig file's ports, not of the map's.
         known = replace(scene, cameras=self.rig.refractive_cameras())
-        return refine_scene(
+        return refined_or_explained(
             scene,
             self.rig,
+            arrays.frame_names,
             self.progress,
             known=known,
             lengths=lengths,

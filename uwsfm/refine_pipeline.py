@@ -51,11 +51,11 @@ from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.refine import (
     Refined,
-    refine_scene,
     rig_options,
     without_empty_frames,
 )
 from uwsfm.trust.diagnosis import explain
+from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
 
 CENTRAL = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
@@ -285,8 +285,14 @@ class _Job:
         self, tracks: Tracks, known: Scene | None, options: dict[str, Any]
     ) -> Refined:
         scene, lengths = self.lengths.placed(self.rig, tracks.frame_names, tracks.scene)
-        return refine_scene(
-            scene, self.rig, self.progress, known=known, lengths=lengths, **options
+        return refined_or_explained(
+            scene,
+            self.rig,
+            tracks.frame_names,
+            self.progress,
+            known=known,
+            lengths=lengths,
+            **options,
         )
 
     def _require_raw(self, refined: Refined) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from uwsfm.sfm.scene_points import retriangulated
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate.rigs import known_cam_from_rig
+from uwsfm.trust.refusal import refined_or_explained
 
 OPTIONS = StartOptions(mapper="refractive")
 """As `uwsfm.reconstruct` has them."""
@@ -113,7 +114,8 @@ def outcome_of(
                 if mapped
                 else simulated_scene(rig, dive, work, wrong)
             )
-            refined = with_deviations(refine_scene(start.scene, rig))
+            names = [dive.names[f] for f in start.frames]
+            refined = with_deviations(refined_by(start.scene, rig, names, diagnosed))
         except UwsfmError as error:
             text = str(error).replace(str(work), "OUT")
             return Outcome(
@@ -122,7 +124,6 @@ def outcome_of(
                 causes=causes_of(error),
                 seconds=time.perf_counter() - clock,
             )
-        names = [dive.names[f] for f in start.frames]
         found = assessed(rig, refined, dive.num_frames, names, diagnosed=diagnosed)
     true_points = points_of_truth(dive, start, refined)
     errors, z_scores = errors_of(rig, refined, dive.true_rig, true_points)
@@ -137,6 +138,15 @@ def outcome_of(
         rms_px=refined.calibration.summary.rms_px,
         seconds=time.perf_counter() - clock,
     )
+
+
+def refined_by(
+    scene: Scene, rig: Rig, names: Sequence[str], diagnosed: bool
+) -> Refined:
+    """The last adjustment, as the jobs have it, or without a cause where it fails."""
+    if diagnosed:
+        return refined_or_explained(scene, rig, names)
+    return refine_scene(scene, rig)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -593,13 +593,21 @@ _SINGLE_LENS = (
         "principal_point", "cy of both by 8 to 20 px", _moved_params(3)(BOTH, 8, 20)
     ),
     _mistake(
-        "", "k1 of one camera by 0.02 to 0.06", _moved_params(4)(LEFT, 0.02, 0.06)
+        "distortion",
+        "k1 of one camera by 0.02 to 0.06",
+        _moved_params(4)(LEFT, 0.02, 0.06),
     ),
-    _mistake("", "k2 of both by 0.03 to 0.1", _moved_params(5)(BOTH, 0.03, 0.1)),
     _mistake(
-        "", "p1 of one camera by 0.002 to 0.006", _moved_params(6)(RIGHT, 2e-3, 6e-3)
+        "distortion", "k2 of both by 0.03 to 0.1", _moved_params(5)(BOTH, 0.03, 0.1)
     ),
-    _mistake("", "p2 of both by 0.002 to 0.006", _moved_params(7)(BOTH, 2e-3, 6e-3)),
+    _mistake(
+        "distortion",
+        "p1 of one camera by 0.002 to 0.006",
+        _moved_params(6)(RIGHT, 2e-3, 6e-3),
+    ),
+    _mistake(
+        "distortion", "p2 of both by 0.002 to 0.006", _moved_params(7)(BOTH, 2e-3, 6e-3)
+    ),
 )
 
 _LENS = (
@@ -700,7 +708,7 @@ _PLACEMENT = (
     ),
     _mistake("quaternion_order", "w, x, y, z, held", _placed(_scalar_first, held=True)),
     _mistake(
-        "",
+        "rotation",
         "rotation off by 0.3 to 1 degree, held",
         _placed(_tilted(0.3, 1.0), held=True),
     ),

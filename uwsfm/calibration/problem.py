@@ -37,7 +37,12 @@ PRIORS = (
 
 
 LENS_PRIORS = PRIORS[4:]
-LENS_PARTS = ("focal", "principal_point", "distortion")
+LENS_PARTS = {
+    "focal": slice(0, 2),
+    "principal_point": slice(2, 4),
+    "distortion": slice(4, NUM_PARAMS),
+}
+"""What of a lens is refined together, and its slots."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +85,11 @@ class CalibrateOptions:
     """Shared by all ports that start from the same index."""
     separate_water_index: bool = False
     """Every port refines an index of its own."""
-    refine_focal: bool = False
+    refine_focal: PerCamera = False
     """Focal lengths of every camera; they trade against water index and distance."""
-    refine_principal_point: bool = False
+    refine_principal_point: PerCamera = False
     """Trades against the normal."""
-    refine_distortion: bool = False
+    refine_distortion: PerCamera = False
     """All distortion parameters that the camera's model has."""
     baseline_stddev_m: float = 0.0
     """Standard deviation of every baseline length; 0 holds the lengths. They are the
@@ -148,7 +153,7 @@ class CalibrateOptions:
                     f"{twice[0]}: the rig file has lens_prior: correlated, which is a "
                     "prior of the lenses already; leave one of the two out"
                 )
-            if any(getattr(self, f"refine_{name}") for name in LENS_PARTS):
+            if any(np.any(getattr(self, f"refine_{name}")) for name in LENS_PARTS):
                 given.append("lens_prior")
         pixels = self.strategy == "joint" and self.error_name == "reprojection"
         if given and not pixels:
@@ -159,7 +164,7 @@ class CalibrateOptions:
         if self.error_name == "reprojection":
             return
         for name in ("refine_focal", "refine_principal_point", "refine_distortion"):
-            if getattr(self, name):
+            if np.any(getattr(self, name)):
                 raise InputError(
                     f"{name} needs the reprojection error: in {self.error_name} the "
                     "pixels' rays in air are given"
@@ -208,14 +213,15 @@ class CalibrateOptions:
         free[:, border.NORMAL] = (normals & flat)[:, None]
         free[:, border.DISTANCE] = distances & flat & ~at_zero
         free[dome, border.CENTER] = centers[dome, None]
-        wanted = np.zeros(NUM_PARAMS, dtype=bool)
-        wanted[:2] = self.refine_focal
-        wanted[2:4] = self.refine_principal_point
-        wanted[4:] = self.refine_distortion
+        wanted = np.zeros((count, NUM_PARAMS), dtype=bool)
+        for part, slots in LENS_PARTS.items():
+            name = f"refine_{part}"
+            flags = _per_camera(name, getattr(self, name), count)
+            wanted[:, slots] = flags[:, None]
         models = [camera.camera.model_name for camera in cameras]
         for c, model in enumerate(models):
             for slot in param_slots(model):
-                free[c, border.FIRST_LENS + slot] = wanted[slot]
+                free[c, border.FIRST_LENS + slot] = wanted[c, slot]
         water = self._first_of_water(ports)
         for c, first in enumerate(water):
             free[c, border.WATER_INDEX] = self.refine_water_index and c == first

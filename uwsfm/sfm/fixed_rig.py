@@ -16,7 +16,11 @@ from uwsfm.sfm.images import Frames
 from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
 from uwsfm.sfm.rig_check import check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
-from uwsfm.sfm.same_frame import PairMatches, read_same_frame_matches
+from uwsfm.sfm.same_frame import (
+    PairMatches,
+    read_same_frame_matches,
+    read_successive_matches,
+)
 
 NEAR_TO_FAR = (0.7, 1.0, 1.4)
 """Depths of the scene of a single camera, by its distance: nothing measures them."""
@@ -59,8 +63,11 @@ def fix_rig(
     def shifted(shift: int) -> list[PairMatches]:
         return read_same_frame_matches(features_path, frames, rig, shift)
 
+    def successive() -> list[PairMatches]:
+        return read_successive_matches(features_path, frames, rig)
+
     if len(cameras) > 1:
-        check_rig(rig, poses, pairs, shifted)
+        check_rig(rig, poses, pairs, shifted, successive)
     rotation = correct_rotations(cameras, poses, pairs)
     if len(cameras) > 1:
         check_rotation(rig, poses, rotation, pairs, shifted)

@@ -80,7 +80,7 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
 
         def concerns(item: RigCamera, model: str = model, code: str = code) -> bool:
             named = item.camera.model_name == model  # its numbers mean the same
-            return named and (code not in _OF_DISTORTION or _distorts(item))
+            return named and (code not in OF_DISTORTION or _distorts(item))
 
         for which in subsets(rig, concerns):
             for what, remedy, change in variants(rig.cameras[which[0]]):
@@ -96,7 +96,8 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
                 )
 
 
-_OF_DISTORTION = ("undistorted", "distortion_sign", "distortion_order", "fisheye")
+OF_DISTORTION = ("undistorted", "distortion_sign", "distortion_order", "fisheye")
+"""Mistakes that concern lenses with distortion only."""
 _Variant = tuple[str, str, _Change]
 
 

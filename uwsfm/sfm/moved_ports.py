@@ -7,16 +7,19 @@ The adjustment will find such ports; a rig is not to be refused for them.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort
+from uwsfm.geometry.unit_vector import angle_between
+from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort, Port
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
@@ -40,6 +43,29 @@ MAX_BEHIND_M = 0.01
 MAX_MISFIT = 1e-3
 """Radians, median over all matches: half a pixel, noise and wrong matches included."""
 LOSS_PX = 3.0
+QUINTILE = 1.9
+"""Fourth quintile over median of |x| for normal x."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MovedPorts:
+    """Two cameras whose ports were moved until they fit their matches best."""
+
+    misfit: float
+    """Median angle between rays and their epipolar plane, radians."""
+    typical: float
+    """`typical_angle` of the same, radians."""
+    strain: float
+    """How far the ports moved, in the standard deviations of `FREEDOM`, all together:
+    root of the sum of squares."""
+
+
+def typical_angle(angles: Array) -> float:
+    """The larger of two estimates of the median size of angles (N,): itself, and by the
+    fourth quintile of normal ones. A mistake in less than half of the frames leaves the
+    median as it is. NaN counts as far off."""
+    sizes = np.nan_to_num(np.abs(angles), nan=np.pi)
+    return float(max(np.median(sizes), np.quantile(sizes, 0.8) / QUINTILE))
 
 
 def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
@@ -50,9 +76,24 @@ def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
         cam_from_rig: Poses (C, 7) of its cameras.
         pair: Matches of two of them, of the same frames.
     """
+    moved = moved_ports(rig, cam_from_rig, pair)
+    return moved is not None and moved.misfit <= MAX_MISFIT
+
+
+def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts | None:
+    """Move the ports of two cameras until they fit their matches best.
+
+    Args:
+        rig: As given.
+        cam_from_rig: Poses (C, 7) of its cameras, which stay.
+        pair: Matches of two of them, of the same frames.
+
+    Returns:
+        None: too few points are in front of both, or no housing has such ports.
+    """
     scene = _one_frame(rig, cam_from_rig, pair)
     if scene.num_points < len(pair.xy_a[:: _step(pair)]) // 2:
-        return False
+        return None
     settings = CalibrateOptions.parsed(FREEDOM)
     columns = settings.border_columns(scene.cameras, np.zeros(2, dtype=bool))
     options = LevenbergMarquardtOptions(
@@ -71,16 +112,42 @@ def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
     ports = state.ports.copy()
     behind = (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
     if np.any(ports[behind, 3] < -MAX_BEHIND_M):
-        return False
+        return None
     ports[behind, 3] = 0.0
-    found = replace(state, ports=ports).to_scene(scene)
+    try:
+        found = replace(state, ports=ports).to_scene(scene)
+    except InputError:  # a dome in front of its lens, a normal that points inwards
+        return None
     if not all(_possible(port) for port in found.ports):
-        return False
+        return None
     step, (first, second) = _step(pair), found.cameras
     xy_a, xy_b = pair.xy_a[::step], pair.xy_b[::step]
     rays = ray_pairs(first, second, found.cam_from_rig[1], xy_a, xy_b)
     angles = np.nan_to_num(np.abs(rays.epipolar_angles()), nan=np.pi)
-    return float(np.median(angles)) <= MAX_MISFIT
+    moves = [
+        _moves(before, after)
+        for before, after in zip(scene.ports, found.ports, strict=True)
+    ]
+    return MovedPorts(
+        misfit=float(np.median(angles)),
+        typical=typical_angle(angles),
+        strain=float(np.linalg.norm(moves)),
+    )
+
+
+def _moves(before: Port, after: Port) -> float:
+    """How far one port moved, in standard deviations of `FREEDOM`."""
+    if isinstance(before, FlatPort) and isinstance(after, FlatPort):
+        tilt = np.degrees(angle_between(before.normal, after.normal))
+        along = after.distance - before.distance
+        return math.hypot(
+            float(tilt) / FREEDOM["normal_stddev_deg"],
+            along / FREEDOM["distance_stddev_m"],
+        )
+    if isinstance(before, DomePort) and isinstance(after, DomePort):
+        step = np.subtract(after.center, before.center)
+        return float(np.linalg.norm(step)) / FREEDOM["center_stddev_m"]
+    return 0.0
 
 
 def _step(pair: PairMatches) -> int:

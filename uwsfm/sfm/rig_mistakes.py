@@ -26,6 +26,10 @@ DOME_RADII_M = (0.05, 0.1)
 SHIFTS = (1, -1, 2, -2, 3, -3)
 """Frames that one camera may be late or early."""
 
+MIRRORED = ("left to right", "top to bottom")
+"""Along each axis of the image, in words."""
+UNMIRROR = "turn off the mirroring where they were exported, or flip them back"
+
 
 def corrections(rig: Rig) -> list[Correction]:
     """Every mistake undone, singly: of the lenses, the ports and the placement."""
@@ -221,12 +225,12 @@ def image_corrections(rig: Rig) -> Iterator[Correction]:
         remedy="exchange them in rig.yaml",
         exchanged=True,
     )
-    for axis, text in enumerate(("left to right", "top to bottom")):
+    for axis, text in enumerate(MIRRORED):
         yield Correction(
             code="mirrored",
             rig=rig,
             what=f"the images are mirrored, {text}",
-            remedy="turn off the mirroring where they were exported, or flip them back",
+            remedy=UNMIRROR,
             flipped=axis,
         )
 

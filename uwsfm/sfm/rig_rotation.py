@@ -8,7 +8,7 @@ does not fit its own images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -86,7 +86,7 @@ def correct_rotations(
         )
     from scipy.optimize import least_squares  # heavy, and no resumed run needs it
 
-    used = [_thinned(pair) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
+    used = [pair.thinned(MAX_MATCHES) for pair in pairs if len(pair) >= MIN_RIG_MATCHES]
 
     def turned(delta: Array) -> Array:
         tangent = np.zeros((num_cameras, 6))
@@ -120,17 +120,6 @@ def correct_rotations(
         turn_deg=turn_deg,
         misfit_before=float(np.median(np.abs(angles(np.asarray(cam_from_rig))))),
         misfit_after=float(np.median(np.abs(angles(poses)))),
-    )
-
-
-def _thinned(pair: PairMatches) -> PairMatches:
-    """At most `MAX_MATCHES` of the matches, evenly taken."""
-    step = -(-len(pair) // MAX_MATCHES)
-    return replace(
-        pair,
-        frame_idx=pair.frame_idx[::step],
-        xy_a=pair.xy_a[::step],
-        xy_b=pair.xy_b[::step],
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -43,6 +43,16 @@ class PairMatches:
     def __len__(self) -> int:
         return len(self.frame_idx)
 
+    def thinned(self, count: int) -> PairMatches:
+        """At most ``count`` of the matches, evenly taken."""
+        step = max(-(-len(self) // count), 1)
+        return replace(
+            self,
+            frame_idx=self.frame_idx[::step],
+            xy_a=self.xy_a[::step],
+            xy_b=self.xy_b[::step],
+        )
+
 
 def read_same_frame_matches(
     database_path: Path, frames: Frames, rig: Rig, shift: int = 0
@@ -64,7 +74,6 @@ def read_same_frame_matches(
     Returns:
         One entry per pair of cameras, those without a match included.
     """
-    cameras = rig.refractive_cameras()
     num_frames = len(frames.names)
     chosen = np.unique(
         np.linspace(0, num_frames - 1, min(num_frames, MAX_FRAMES)).astype(np.int64)
@@ -72,34 +81,65 @@ def read_same_frame_matches(
     found: list[PairMatches] = []
     with opened(database_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        for a, b in combinations(range(len(cameras)), 2):
-            rows = []
-            for f in chosen[
-                (chosen >= -shift) & (chosen < num_frames - shift)
-            ].tolist():
-                id_a = ids[frames.image_name(a, f)]
-                id_b = ids[frames.image_name(b, f + shift)]
-                matches = database.read_matches(id_a, id_b)
-                if len(matches) < MIN_MATCHES:
-                    continue
-                xy_a = _keypoints(database, id_a)[matches[:, 0]]
-                xy_b = _keypoints(database, id_b)[matches[:, 1]]
-                covered = rig.cameras[a].covers(xy_a) & rig.cameras[b].covers(xy_b)
-                xy_a, xy_b = xy_a[covered], xy_b[covered]
-                good = _epipolar_inliers(cameras[a], cameras[b], xy_a, xy_b)
-                frame = np.full((int(good.sum()), 1), float(f))
-                rows.append(np.hstack([frame, xy_a[good], xy_b[good]]))
-            table = np.concatenate(rows) if rows else np.empty((0, 5))
-            found.append(
-                PairMatches(
-                    camera_a=a,
-                    camera_b=b,
-                    frame_idx=table[:, 0].astype(np.int64),
-                    xy_a=table[:, 1:3].copy(),
-                    xy_b=table[:, 3:5].copy(),
-                )
-            )
+        for a, b in combinations(range(len(rig.cameras)), 2):
+            inside = (chosen >= -shift) & (chosen < num_frames - shift)
+            steps = [(f, f + shift) for f in chosen[inside].tolist()]
+            found.append(_agreeing(database, ids, frames, rig, (a, b), steps))
     return found
+
+
+def read_successive_matches(
+    database_path: Path, frames: Frames, rig: Rig
+) -> list[PairMatches]:
+    """Matches of each camera's images with its next ones, as `read_same_frame_matches`.
+
+    Returns:
+        One entry per camera, both of whose sides are that camera.
+    """
+    steps = [(f, f + 1) for f in range(min(len(frames.names) - 1, MAX_FRAMES))]
+    with opened(database_path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        return [
+            _agreeing(database, ids, frames, rig, (c, c), steps)
+            for c in range(len(rig.cameras))
+        ]
+
+
+def _agreeing(
+    database: pycolmap.Database,
+    ids: dict[str, int],
+    frames: Frames,
+    rig: Rig,
+    pair: tuple[int, int],
+    steps: list[tuple[int, int]],
+) -> PairMatches:
+    """Matches of two cameras, or of one with itself, in pairs of frames, that agree
+    with one epipolar geometry each; numbered by the first frame."""
+    (a, b), cameras = pair, rig.refractive_cameras()
+    rows = []
+    for first, second in steps:
+        id_a, id_b = (
+            ids[frames.image_name(a, first)],
+            ids[frames.image_name(b, second)],
+        )
+        matches = database.read_matches(id_a, id_b)
+        if len(matches) < MIN_MATCHES:
+            continue
+        xy_a = _keypoints(database, id_a)[matches[:, 0]]
+        xy_b = _keypoints(database, id_b)[matches[:, 1]]
+        covered = rig.cameras[a].covers(xy_a) & rig.cameras[b].covers(xy_b)
+        xy_a, xy_b = xy_a[covered], xy_b[covered]
+        good = _epipolar_inliers(cameras[a], cameras[b], xy_a, xy_b)
+        frame = np.full((int(good.sum()), 1), float(first))
+        rows.append(np.hstack([frame, xy_a[good], xy_b[good]]))
+    table = np.concatenate(rows) if rows else np.empty((0, 5))
+    return PairMatches(
+        camera_a=a,
+        camera_b=b,
+        frame_idx=table[:, 0].astype(np.int64),
+        xy_a=table[:, 1:3].copy(),
+        xy_b=table[:, 3:5].copy(),
+    )
 
 
 def _keypoints(database: pycolmap.Database, image_id: int) -> Array:

@@ -26,7 +26,11 @@ from uwsfm.sfm.epipolar import ray_gaps_px, relative_pose
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.rig_check import check_rig, check_rotation
 from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, correct_rotations
-from uwsfm.sfm.same_frame import PairMatches, read_same_frame_matches
+from uwsfm.sfm.same_frame import (
+    PairMatches,
+    read_same_frame_matches,
+    read_successive_matches,
+)
 
 START_GAPS = 8.0
 """Times the median gap, while the ports are guesses. With straight ports for ports
@@ -75,7 +79,10 @@ def same_frame_scene(rig: Rig, frames: Frames, database_path: Path) -> Scene:
     def shifted(shift: int) -> list[PairMatches]:
         return read_same_frame_matches(database_path, frames, rig, shift)
 
-    check_rig(rig, rig.cam_from_rig, pairs, shifted)
+    def successive() -> list[PairMatches]:
+        return read_successive_matches(database_path, frames, rig)
+
+    check_rig(rig, rig.cam_from_rig, pairs, shifted, successive)
     cameras = rig.refractive_cameras()
     rotation = correct_rotations(cameras, rig.cam_from_rig, pairs)
     check_rotation(rig, rig.cam_from_rig, rotation, pairs, shifted)

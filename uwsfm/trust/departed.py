@@ -10,6 +10,9 @@ DEPARTED, FAR_DEPARTED = 4.0, 10.0
 """Standard deviations of given and estimate together; and of what was given alone, for
 an estimate that is moved towards it by three of its own. For a port distance whose
 accuracy was not stated they are factors of 3 and 6."""
+DEPARTED_TOGETHER = 3.0
+"""Of all port distances of a rig by one factor: a single number for each dive, where
+the ones above are many."""
 TILTED_DEG, FAR_TILTED_DEG = 15.0, 25.0
 """A port turned by more against the normal given: no mount is so far off by chance, and
 at the second the port would stand in the way of its own lens."""
@@ -29,6 +32,7 @@ def departed_reasons(departures: Sequence[Departure]) -> list[Reason]:
     """A reason for every number that has left what was given."""
     judges = {
         "distance_m": _distance,
+        "distances_share": _distances,
         "tilt_deg": _tilt,
         "center_share": _dome,
         "focal_share": _focal,
@@ -37,7 +41,10 @@ def departed_reasons(departures: Sequence[Departure]) -> list[Reason]:
         "unseen_share": _unseen,
     }
     found = (judges[item.what](item) for item in departures)
-    return [item for item in found if item is not None]
+    reasons = [item for item in found if item is not None]
+    if any(item.code == "port_distance" for item in reasons):
+        return [item for item in reasons if item.code != "port_distances"]
+    return reasons
 
 
 def _numbers(item: Departure) -> dict[str, float]:
@@ -69,6 +76,20 @@ def _distance(item: Departure) -> Reason | None:
     severe = unreadable or item.z_at_least >= FAR_DEPARTED
     severity = DOES_NOT_FIT if severe else DOUBTFUL
     return reason("port_distance", text, severity, **_numbers(item))
+
+
+def _distances(item: Departure) -> Reason | None:
+    """All port distances by one factor, as a wrong baseline makes them."""
+    if item.z < DEPARTED_TOGETHER:
+        return None
+    text = (
+        f"The ports of {item.camera} together came out at {item.estimate:.2g} times "
+        f"their distances in the rig file (± {item.stddev:.2g} from the images, "
+        f"± {item.given_stddev:.2g} from the ruler"
+        f"{'' if item.stated else ', assumed'}), and nothing else checks the length "
+        "that gives the scale: measure the ports and the baseline, and check its unit."
+    )
+    return reason("port_distances", text, DOUBTFUL, **_numbers(item))
 
 
 def _tilt(item: Departure) -> Reason | None:

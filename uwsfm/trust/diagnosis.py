@@ -19,10 +19,13 @@ from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResul
 from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
+from uwsfm.sfm.lens_mistakes import OF_DISTORTION
 from uwsfm.solver.threads import limited
 from uwsfm.trust.midway import (
+    ZoomTrial,
     coarse_firsts,
     fine_firsts,
+    nearby_zooms,
     shifts_since,
     zoom_trial,
 )
@@ -41,6 +44,9 @@ MAX_TILT_DEG = 15.0
 RULER_M, RULER_SHARE = 0.01, 0.5
 """What a port's distance in a rig file is taken to be known to: a ruler held against a
 housing, to the centre of a lens that nobody sees."""
+AS_GOOD = 0.5
+"""A hypothesis fits as well as another that contains it: 1 % of the RMS of some 4000
+coordinates is 80 of chi square, where a dozen free numbers take a dozen."""
 AT_ZERO = 2.0
 """Strain of a port that came out at its lens, which no housing has."""
 MAX_EXPLANATIONS = 3
@@ -111,11 +117,11 @@ def options_of(calibration: CalibrationResult) -> dict[str, Any]:
     pixels.
     """
     given, plain = calibration.options, CalibrateOptions()
-    pairs = ((name, getattr(given, name)) for name in _KEPT)
+    pairs = ((name, getattr(given, name)) for name in KEPT)
     return {name: value for name, value in pairs if value != getattr(plain, name)}
 
 
-_KEPT = (
+KEPT = (
     *PRIORS,
     "refine_focal",
     "refine_principal_point",
@@ -123,6 +129,7 @@ _KEPT = (
     "refine_water_index",
     "separate_water_index",
 )
+"""Fields of `CalibrateOptions` that a trial takes over from the result."""
 
 
 def diagnose(
@@ -151,25 +158,61 @@ def diagnose(
         *shifts_since(rig, part, base.fit, names),
     ]
     tried = experiments.all(todo, part)
-    firsts = coarse_firsts(part.num_frames)
-    zoomed = [zoom_trial(rig, first, names[first]) for first in firsts]
-    coarse = experiments.all(zoomed, part)
-    if coarse:
-        best = min(range(len(coarse)), key=lambda k: coarse[k].total)
-        near = fine_firsts(coarse[best].trial.first, part.num_frames)
-        coarse += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
-    tried += _more_than_focal(coarse, tried)
+    tried += _zooms(experiments, rig, part, names, (base, *tried))
     if tried:
         best_fit = min(tried, key=lambda one: one.total).fit
         base = experiments.again(base, best_fit, part)
-    return explanations(base, tried)
+    return explanations(base, without_refuted(tried))
 
 
-def _more_than_focal(zoomed: list[Tried], tried: Sequence[Tried]) -> list[Tried]:
-    """Changes of zoom that explain clearly more than one wrong focal length does."""
-    focal = [one.total for one in tried if one.trial.code == "focal"]
-    limit = min(focal, default=math.inf) - CLEAR
-    return [one for one in zoomed if one.total <= limit]
+def without_refuted(tried: Sequence[Tried]) -> list[Tried]:
+    """Orders and signs of distortion coefficients against coefficients that are free.
+
+    The free ones contain the others. So an order that is right fits as well as they do;
+    one that fits worse is refuted by them.
+    """
+
+    def plain(one: Tried) -> float:
+        return one.total - one.trial.handicap
+
+    free = [plain(one) for one in tried if one.trial.code == "distortion"]
+    limit = min(free, default=math.inf) + AS_GOOD
+    return [
+        one
+        for one in tried
+        if one.trial.code not in OF_DISTORTION or plain(one) <= limit
+    ]
+
+
+def _zooms(
+    experiments: _Experiments,
+    rig: Rig,
+    part: Scene,
+    names: Sequence[str],
+    tried: Sequence[Tried],
+) -> list[Tried]:
+    """The likeliest change of zoom, if it explains clearly more than one focal length.
+
+    Args:
+        experiments: Runs the trials.
+        rig: As given.
+        part: The observations.
+        names: Of its frames.
+        tried: The rig as given, and the other trials.
+    """
+    firsts = coarse_firsts(part.num_frames)
+    found = experiments.all([zoom_trial(rig, f, names[f]) for f in firsts], part)
+    if not found:
+        return []
+    best = min(found, key=lambda one: one.total)
+    near = fine_firsts(best.trial.first, part.num_frames)
+    found += experiments.all([zoom_trial(rig, f, names[f]) for f in near], part)
+    best = min(found, key=lambda one: one.total)
+    assert isinstance(best.trial, ZoomTrial)
+    found += experiments.all(nearby_zooms(best.trial, best.fit), part)
+    best = min(found, key=lambda one: one.total)
+    common = [one.total for one in tried if one.trial.code in ("", "focal")]
+    return [best] if best.total <= min(common) - CLEAR else []
 
 
 class _Experiments:

@@ -45,7 +45,8 @@ class Departure:
 
     camera: str
     what: str
-    """"distance_m", "tilt_deg", "center_share" (of the dome's radius), "focal_share",
+    """"distance_m", "distances_share" (of all ports together, 1: as given),
+    "tilt_deg", "center_share" (of the dome's radius), "focal_share",
     "principal_point_px", "stretch" (of the distortion at the image's edge, 1: none),
     "unseen_share" (of the image's edge, where the lens has no ray)"""
     given: float
@@ -85,7 +86,53 @@ def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...
         found += _port(camera, after.port, index, refined, calibration, metric)
         if np.any(refined[border.FIRST_LENS :]):
             found += _lens(camera, after, index, calibration)
-    return tuple(found)
+    return (*found, *_common_factor(rig, calibration, found))
+
+
+def _common_factor(
+    rig: Rig, calibration: CalibrationResult, found: list[Departure]
+) -> list[Departure]:
+    """The factor by which all port distances together left the rig file's.
+
+    A baseline that is too long lengthens all of them, and nothing else checks it. The
+    factor is the generalised least squares estimate from all differences. Errors of
+    rulers that are assumed are taken as one and the same error, which is the careful
+    way: whoever misjudges one port misjudges the next one alike.
+    """
+    index = {camera.name: i for i, camera in enumerate(rig.cameras)}
+    items = [
+        item
+        for item in found
+        if item.what == "distance_m" and math.isfinite(item.stddev) and item.given > 0.0
+    ]
+    if len(items) < 2:
+        return []
+    covariance = calibration.covariance
+    cameras = [index[item.camera] for item in items]
+    cols = covariance.border_cols[cameras, border.DISTANCE]
+    images = covariance.border[np.ix_(cols, cols)]
+    # Correlations of the one estimate of the covariance, sizes of the larger.
+    larger = np.array([item.stddev for item in items]) / np.sqrt(np.diag(images))
+    images = images * np.outer(larger, larger)
+    stddevs = np.array([item.given_stddev for item in items])
+    assumed = np.array([not item.stated for item in items])
+    rulers = np.diag(stddevs**2)
+    rulers[np.ix_(assumed, assumed)] = np.outer(stddevs[assumed], stddevs[assumed])
+    given = np.array([item.given for item in items])
+    weights = np.linalg.solve(images + rulers, given)
+    weights /= weights @ given
+    differences = np.array([item.estimate - item.given for item in items])
+    return [
+        Departure(
+            camera=", ".join(item.camera for item in items),
+            what="distances_share",
+            given=1.0,
+            estimate=1.0 + float(weights @ differences),
+            stddev=math.sqrt(weights @ images @ weights),
+            given_stddev=math.sqrt(weights @ rulers @ weights),
+            stated=not bool(assumed.any()),
+        )
+    ]
 
 
 def _port(

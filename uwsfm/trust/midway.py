@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.trust.mistakes import FOCAL, MIN_FRAMES_LEFT, Trial, shifts
+from uwsfm.trust.mistakes import FOCAL, FREE, MIN_FRAMES_LEFT, Trial, shifts
 from uwsfm.trust.trials import Fit, adjusted
 
 NUM_COARSE = 7
 """Frames from which on a zoom may have changed, before their neighbours are tried."""
-ZOOM_HANDICAP = 4.0
-"""Two focal lengths for each camera, and every track cut in two: a lot is freed."""
+ZOOM_HANDICAP = 2.0 * FREE
+"""Two focal lengths for each camera."""
+POWERS = (0.7, 1.4)
+"""Of a change of zoom that are tried after it."""
 MIN_ZOOM = 0.006
 """Relative: a smaller change of the focal length is none."""
 CLEAR_CHANGE = 3.0
@@ -28,26 +29,42 @@ the frame."""
 
 @dataclass(frozen=True, kw_only=True)
 class ZoomTrial(Trial):
-    """Focal lengths of their own before and after a frame."""
+    """Focal lengths of their own before and after a frame, everything else as one."""
+
+    ratios: tuple[float, ...] = ()
+    """(C,) after over before; empty: as the two parts of the dive have them, each
+    adjusted alone. Their ports then move as well, so that is only a start."""
 
     def fit(self, scene: Scene, options: dict[str, Any]) -> Fit | None:
-        halves = []
-        for late in (False, True):
-            part = _in_frames(scene, (scene.frame_idx >= self.first) == late)
-            half = adjusted(part, self.rig, **{**options, **FOCAL})
-            if half is None:
-                return None
-            halves.append(half)
-        before, after = (_focals(half) for half in halves)
-        if np.abs(after / before - 1.0).max() < MIN_ZOOM:
+        free = {**options, **FOCAL}
+        ratios = np.array(self.ratios or self._of_parts(scene, free))
+        if np.abs(ratios - 1.0).max(initial=0.0) < MIN_ZOOM:
             return None
-        return replace(
-            halves[0],
-            squares=np.concatenate([half.squares for half in halves]),
-            unknowns=sum(half.unknowns for half in halves),
-            turn_deg=max(half.turn_deg for half in halves),
-            focals=(before, after),
+        late = scene.frame_idx >= self.first
+        factor = np.where(late, ratios[scene.camera_idx], 1.0)
+        lenses = np.array([camera.lens for camera in self.rig.refractive_cameras()])
+        center = lenses[scene.camera_idx, 2:4]
+        xy = center + (scene.xy - center) / factor[:, None]
+        fit = adjusted(replace(scene, xy=xy), self.rig, **free)
+        if fit is None:
+            return None
+        before = np.array([camera.lens[0] for camera in fit.scene.cameras])
+        squares = fit.squares * factor**2  # of the pixels that were given
+        return replace(fit, squares=squares, focals=(before, ratios * before))
+
+    def _of_parts(self, scene: Scene, options: dict[str, Any]) -> list[float]:
+        late = scene.frame_idx >= self.first
+        parts = [
+            adjusted(_in_frames(scene, rows), self.rig, **options)
+            for rows in (~late, late)
+        ]
+        before, after = (
+            [] if part is None else [camera.lens[0] for camera in part.scene.cameras]
+            for part in parts
         )
+        if not before or not after:
+            return []
+        return [b / a for a, b in zip(before, after, strict=True)]
 
 
 def zoom_trial(rig: Rig, first: int, first_name: str) -> ZoomTrial:
@@ -64,14 +81,24 @@ def zoom_trial(rig: Rig, first: int, first_name: str) -> ZoomTrial:
     )
 
 
+def nearby_zooms(trial: ZoomTrial, fit: Fit) -> list[ZoomTrial]:
+    """Less of a change, more of it, and that of one camera alone."""
+    assert fit.focals is not None
+    before, after = fit.focals
+    ratios = after / before
+    count = len(ratios)
+    several = [ratios**power for power in POWERS]
+    if count > 1:
+        every = float(np.exp(np.mean(np.log(ratios))))
+        several += [np.full(count, every**power) for power in (1.0, *POWERS)]
+        several += [np.where(np.arange(count) == c, ratios, 1.0) for c in range(count)]
+    return [replace(trial, ratios=tuple(some.tolist())) for some in several]
+
+
 def _zoom_words(fit: Fit) -> str:
     assert fit.focals is not None
     before, after = fit.focals
     return f" ({', '.join(f'{ratio:.3f} times' for ratio in after / before)})"
-
-
-def _focals(fit: Fit) -> Array:
-    return np.array([camera.lens[0] for camera in fit.scene.cameras])
 
 
 def coarse_firsts(num_frames: int) -> list[int]:

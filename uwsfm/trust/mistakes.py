@@ -19,6 +19,7 @@ from uwsfm.models.port import FlatPort
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.correction import Correction
+from uwsfm.sfm.lens_mistakes import distortion, num_pinhole
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
     corrected_pixels,
@@ -83,6 +84,8 @@ def trials(rig: Rig, num_frames: int) -> Iterator[Trial]:
     for correction in corrections(rig):
         yield _of_correction(correction)
     yield from _free_lenses(rig)
+    yield from _free_distortions(rig)
+    yield from _free_rotation(rig)
     yield from shifts(rig, num_frames)
 
 
@@ -122,12 +125,7 @@ FREE = 1.0
 """Handicap of two numbers that are set free for each camera."""
 FOCAL = {"refine_focal": True, "focal_stddev": 0.5}
 CENTER = {"refine_principal_point": True, "principal_point_stddev_px": 200.0}
-LENS = {
-    **FOCAL,
-    **CENTER,
-    "refine_distortion": True,
-    "distortion_stddev": 0.5,
-}
+DISTORTION_STDDEV = 0.5
 """Priors that hold nothing but what no image shows."""
 
 
@@ -155,6 +153,42 @@ def _free_lenses(rig: Rig) -> Iterator[Trial]:
     )
 
 
+def _free_distortions(rig: Rig) -> Iterator[Trial]:
+    """The distortion of all cameras, then of each alone: the numbers are wrong, by no
+    order or sign that has a name."""
+    every = tuple(range(len(rig.cameras)))
+    for which in dict.fromkeys((every, *((c,) for c in every))):
+        names = " and ".join(repr(rig.cameras[c].name) for c in which)
+        yield Trial(
+            code="distortion",
+            what=f"the distortion of {names}, as given, does not fit",
+            remedy="check these coefficients, their order and their sign, or calibrate "
+            "the lens anew",
+            rig=rig,
+            options={
+                "refine_distortion": tuple(c in which for c in every),
+                "distortion_stddev": DISTORTION_STDDEV,
+            },
+            handicap=FREE * len(which),
+            estimate=partial(_distortion_words, rig, which),
+        )
+
+
+def _free_rotation(rig: Rig) -> Iterator[Trial]:
+    """The rotation between the cameras, where the rig file holds it."""
+    if rig.cam_from_rig is None or len(rig.cameras) < 2 or rig.refine_cam_from_rig:
+        return
+    names = " and ".join(repr(camera.name) for camera in rig.cameras[1:])
+    yield Trial(
+        code="rotation",
+        what=f"cam_from_rig of {names}, which is held, is wrong",
+        remedy="write refine_cam_from_rig: true, or calibrate the placement anew",
+        rig=replace(rig, refine_cam_from_rig=True),
+        handicap=FREE,
+        estimate=lambda fit: f" (it turns by {fit.turn_deg:.2f} degrees)",
+    )
+
+
 def _lens_words(rig: Rig, fit: Fit, part: slice, names: str) -> str:
     """What two numbers of each lens came out as, and what they were."""
     words = [
@@ -163,6 +197,19 @@ def _lens_words(rig: Rig, fit: Fit, part: slice, names: str) -> str:
         for new, old in zip(fit.scene.cameras, rig.refractive_cameras(), strict=True)
     ]
     return f" ({names}: {'; '.join(words)})"
+
+
+def _distortion_words(rig: Rig, which: tuple[int, ...], fit: Fit) -> str:
+    """Which coefficients of some lenses came out as what, and what they were."""
+    words = []
+    for c in which:
+        item = rig.cameras[c]
+        first = num_pinhole(item)
+        names = item.camera.params_info.split(", ")[first:]
+        new = fit.scene.cameras[c].camera.params[first:]
+        pairs = zip(names, new, distortion(item), strict=True)
+        words.append(", ".join(f"{n} {to:.4f} for {was:.4f}" for n, to, was in pairs))
+    return f" ({'; '.join(words)})"
 
 
 def shifts(
@@ -219,6 +266,7 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
             f"{rig.baseline_m:.3g} m",
             remedy=f"check the unit of translation_m: {words}",
             rig=_shorter(rig, factor),
+            handicap=0.0 if given < MAX_DISTANCE_M else RARE,
         )
     for times in PORT_FACTORS:
         low, high = (times * port.distance for port in (flat[0], flat[-1]))
