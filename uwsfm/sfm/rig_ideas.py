@@ -212,9 +212,9 @@ def zoom_ideas(rig: Rig, pair: PairMatches) -> list[_Idea]:
         correction = Correction(
             code="zoom_changed",
             rig=rig,
-            what=f"the focal length of {name!r} is another one from the "
-            f"{split + 1}th frame on, about {1.0 / factor:.2f} times, or that of "
-            "another camera",
+            what=f"the focal length of {name!r} is another one after the first "
+            f"{split} frames, about {1.0 / factor:.2f} times, or that of another "
+            "camera",
             remedy="reconstruct the frames before and after it with a lens of their "
             "own, and hold zoom and focus in the next dive",
         )
