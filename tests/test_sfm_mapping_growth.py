@@ -98,3 +98,22 @@ def _check_counts(growing: GrowingMap, free: np.ndarray, added: int) -> None:
     counts = np.bincount(scene.frame_idx[shared], minlength=scene.num_frames)
     others = np.setdiff1d(np.arange(1, scene.num_frames), free)
     assert counts[free].min() >= counts[others].max(initial=0)
+
+
+def test_points_that_only_the_two_cameras_of_a_frame_see_are_kept():
+    growing, poses = matched_dive(num_frames=6)
+    of = growing.correspondences
+    growing.place(np.arange(6), poses)
+    growing.finish_points(MAX_ERROR_PX)
+    # Matches are right, and join the keypoints of a point to one track.
+    start, keypoints = of.tracks(np.arange(len(of.matches)))
+    track = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    frames = of.frame[keypoints]
+    in_one_frame = np.flatnonzero(
+        (np.diff(start) == 2) & (frames[start[:-1]] == frames[start[1:] - 1])
+    )
+    assert len(in_one_frame) > 20
+    kept = growing.point_of[keypoints] >= 0
+    # Noise of 0.4 px moves hardly any point by a third of its depth.
+    assert np.mean(kept[np.isin(track, in_one_frame)]) > 0.95
+    assert np.mean(kept) > 0.95

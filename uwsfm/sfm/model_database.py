@@ -25,7 +25,6 @@ from uwsfm.sfm.images import natural_key
 from uwsfm.sfm.mapping.adjustment import adjust_locally, neighbours
 from uwsfm.sfm.mapping.correspondences import Correspondences, in_rows
 from uwsfm.sfm.mapping.growing_map import GrowingMap
-from uwsfm.sfm.mapping.incremental import MIN_IMAGES
 from uwsfm.sfm.mapping.registration import Ranking, register_next
 from uwsfm.sfm.model_start import Tracks
 from uwsfm.sfm.refine import MAX_ERROR_PX, Refined
@@ -203,7 +202,7 @@ def with_database(
             break
         points = adjust_locally(growing, neighbours(growing, added))
         growing.filter(points, MAX_ERROR_PX)
-    growing.retriangulate(MAX_ERROR_PX, MIN_IMAGES)
+    growing.finish_points(MAX_ERROR_PX)
     scene, seen = growing.scene()
     keypoints = [
         of.xy[of.first[image] : of.first[image + 1]]

@@ -20,6 +20,8 @@ from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
 from uwsfm.sfm.mapping.triangulation import Views
 from uwsfm.sfm.noise_floor import NoiseFloor
 
+MIN_IMAGES = 3
+"""That see a point of the finished map without having to ask its neighbours."""
 NUM_NEIGHBOURS = 5
 MAX_DEPTH_RATIO = 1.5
 """Of a point that only two images see and its neighbours': on a reef 0.02 % of the
@@ -214,6 +216,12 @@ class GrowingMap:
         everything = np.arange(len(self.correspondences.matches))
         matches = self.consistent(everything, max_error_px)
         self._add_tracks(matches, max_error_px, min_images)
+
+    def finish_points(self, max_error_px: float) -> None:
+        """Find the points of a map that grows no more: all that are well seen, and
+        those of two images, of one frame or of two, that fit in between them."""
+        self.retriangulate(max_error_px, MIN_IMAGES)
+        self.add_pairs(max_error_px)
 
     def add_pairs(self, max_error_px: float) -> None:
         """Find points that two images see only, where points around them agree.

@@ -45,8 +45,6 @@ from uwsfm.sfm.options import StartOptions
 MIN_FRAMES_FOR_HOUSINGS = 3
 END_ERRORS = 6.0
 """Times the median error: the tolerance once the housings are adjusted."""
-MIN_IMAGES = 3
-"""That see a point of the finished map: of a rig, in two frames or more."""
 GROWTH = 1.25
 """Everything is adjusted when there are so many times more frames than last time."""
 RENEWAL = 1.6
@@ -291,13 +289,11 @@ class Grower:
                 break
 
     def finish(self) -> None:
-        """Register all frames that fit; points of the finished map are well seen."""
+        """Register all frames that fit, and find the points of the finished map."""
         growing = self.map
         self.grow(growing.correspondences.num_frames)
         if growing.num_registered > 1:
-            growing.retriangulate(self.max_error_px, MIN_IMAGES)
-            if len(growing.cameras) == 1:  # two images are two frames
-                growing.add_pairs(self.max_error_px)
+            growing.finish_points(self.max_error_px)
 
     def _place(self, frames: IndexArray, rig_from_world: Array) -> None:
         poses = self.map.rig_from_world.copy()
