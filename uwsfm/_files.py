@@ -1,16 +1,80 @@
 """Outputs are written beside their place and renamed: never half a file."""
 
+import json
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from uwsfm.errors import InputError
 
 PARTIAL = ".uwsfm-partial-"
 """Start of the names of what is being written; a killed process leaves it behind."""
+
+
+def require_regular(path: Path) -> os.stat_result:
+    """The status of a file that is to be read.
+
+    A pipe or a device would be waited on for ever, or has no end.
+
+    Raises:
+        InputError: there is none, it cannot be looked at, or it is no ordinary file;
+            the caller puts the path in front.
+    """
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise InputError("there is no such file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"cannot be read: {reason}") from None
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError("cannot be read: Is a directory")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError("is a pipe or a device; copy it to a file first")
+    return status
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """The text of a file in UTF-8.
+
+    Args:
+        path: the file.
+        max_bytes: a longer one is no such file, and would take long to refuse.
+
+    Raises:
+        InputError: as `require_regular`; it is too long, or no text in UTF-8.
+    """
+    size = require_regular(path).st_size
+    if size > max_bytes:
+        raise InputError(
+            f"has {size / 1e6:.1f} MB, but files of this kind have less than "
+            f"{max_bytes / 1e6:.0f} MB; is it the right file?"
+        )
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError("is not a text file in UTF-8") from None
+
+
+def read_json(path: Path, max_bytes: int) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        InputError: as `read_text`, or it is no JSON.
+    """
+    try:
+        return json.loads(read_text(path, max_bytes))
+    except InputError:
+        raise
+    except (ValueError, RecursionError):
+        raise InputError("is damaged, or no JSON file") from None
 
 
 @contextmanager

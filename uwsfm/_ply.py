@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm._files import replaced_file
+from uwsfm._files import replaced_file, require_regular
+from uwsfm._paths import shown
 from uwsfm.errors import InputError
 
 _NAMES = {
@@ -31,6 +32,8 @@ _KINDS = {name: kind for kind, name in _NAMES.items()} | {
     "float64": "<f8",
 }
 _MAX_HEADER = 65_536
+_MAX_DIGITS = 18
+"""Of a count: more vertices than any disk holds."""
 
 
 def write_ply(
@@ -77,38 +80,63 @@ def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
     """
     path = Path(path)
     try:
+        num_bytes = require_regular(path).st_size
         with path.open("rb") as file:
-            lines, size = _header(path, file.read(_MAX_HEADER))
+            lines, size = _header(file.read(_MAX_HEADER))
+        count, fields = _vertex_element(lines)
+        kind = np.dtype(fields)
+        there = max(num_bytes - size, 0) // kind.itemsize
+        if there < count:  # before memory is taken for what is not there
+            raise InputError(f"holds {there} of its {count} vertices")
+        table = np.fromfile(path, dtype=kind, count=count, offset=size)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
-    if lines[1:2] != ["format binary_little_endian 1.0"]:
-        raise InputError(f"{path}: only binary little-endian PLY files are read")
-    count, fields = -1, []
-    element = ""
-    for words in (line.split() for line in lines[2:]):
-        if words[:1] == ["element"]:
-            if element == "vertex":
-                break
-            if element:
-                raise InputError(f"{path}: element {element} precedes the vertices")
-            element, count = words[1], int(words[2])
-        elif words[:1] == ["property"]:
-            if len(words) != 3 or words[1] not in _KINDS:
-                raise InputError(f"{path}: property '{' '.join(words[1:])}' of vertex")
-            fields.append((words[2], _KINDS[words[1]]))
-    if element != "vertex" and not fields:
-        raise InputError(f"{path}: a PLY file without vertices")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     comments = [line[8:] for line in lines if line.startswith("comment ")]
-    table = np.fromfile(path, dtype=fields, count=count, offset=size)
-    if len(table) != count:
-        raise InputError(f"{path}: holds {len(table)} of its {count} vertices")
     return table, comments
 
 
-def _header(path: Path, start: bytes) -> tuple[list[str], int]:
+def _header(start: bytes) -> tuple[list[str], int]:
     """Lines of the header and its size in bytes."""
     mark = b"end_header\n"
     end = start.find(mark)
-    if not start.startswith(b"ply\n") or end < 0:
-        raise InputError(f"{path}: not a PLY file")
-    return start[:end].decode("ascii", "replace").splitlines(), end + len(mark)
+    if not start.startswith((b"ply\n", b"ply\r\n")):
+        raise InputError("not a PLY file")
+    lines = start[: max(end, 0)].decode("utf-8", "replace").splitlines()
+    if end < 0 and b"end_header" not in start:
+        raise InputError(
+            "not a PLY file: no end_header within its first "
+            f"{min(len(start), _MAX_HEADER)} bytes"
+        )
+    if end < 0 or lines[1:2] != ["format binary_little_endian 1.0"]:
+        raise InputError("only binary little-endian PLY files are read")
+    return lines, end + len(mark)
+
+
+def _vertex_element(lines: list[str]) -> tuple[int, list[tuple[str, str]]]:
+    """Number of the vertices, and name and kind of each of their properties."""
+    count, fields = -1, []
+    for line in lines[2:]:
+        words = line.split()
+        if words[:1] == ["element"]:
+            if count >= 0:
+                break
+            if len(words) != 3 or not words[2].isascii() or not words[2].isdecimal():
+                raise InputError(
+                    f"{shown(line)!r} in its header: expected 'element NAME COUNT'"
+                )
+            if words[1] != "vertex":
+                raise InputError(f"element {shown(words[1])} precedes the vertices")
+            if len(words[2]) > _MAX_DIGITS:
+                raise InputError(f"claims {shown(words[2])} vertices: it is damaged")
+            count = int(words[2])
+        elif words[:1] == ["property"]:
+            if len(words) != 3 or words[1] not in _KINDS:
+                raise InputError(f"property '{shown(' '.join(words[1:]))}' of vertex")
+            if words[2] in dict(fields):
+                raise InputError(f"property {shown(words[2])} of vertex comes twice")
+            fields.append((words[2], _KINDS[words[1]]))
+    if count < 0 or not fields:
+        raise InputError("a PLY file without vertices")
+    return count, fields

@@ -6,6 +6,7 @@ Heavy packages are imported inside the commands, so that `uwsfm --help` is insta
 import io
 import logging
 import sys
+import traceback
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,6 +65,8 @@ app.command()(report)
 app.command()(view)
 
 FAILED, WRONG_INPUT = 1, 2
+_debug = {"shown": False}
+"""Whether tracebacks are shown: `main` needs it after the options are gone."""
 
 
 def _print_version(wanted: bool) -> None:
@@ -80,6 +83,10 @@ def _global_options(
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Show COLMAP's own log.")
     ] = False,
+    debug: Annotated[
+        bool,
+        typer.Option("--debug", help="Show where in the program an error comes from."),
+    ] = False,
     version: Annotated[
         bool,
         typer.Option(
@@ -90,6 +97,7 @@ def _global_options(
         ),
     ] = False,
 ) -> None:
+    _debug.update(shown=debug)
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(message)s"
     )
@@ -380,20 +388,35 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     try:
         app()
-    except InputError as error:
-        _fail(str(error), WRONG_INPUT)
-    except UwsfmError as error:
-        _fail(str(error), FAILED)
-    except OSError as error:
-        _fail(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), FAILED)
-    except MemoryError:
-        _fail("out of memory", FAILED)
     except SystemExit:
         if _signals.received.is_set():
             sys.exit(_signals.EXIT_CODE)
         raise
+    except Exception as error:
+        if _debug["shown"]:
+            traceback.print_exception(error)
+        message, code = _words(error)
+        typer.echo(f"error: {message}", err=True)
+        sys.exit(code)
 
 
-def _fail(message: str, code: int) -> None:
-    typer.echo(f"error: {message}", err=True)
-    sys.exit(code)
+def _words(error: Exception) -> tuple[str, int]:
+    """One sentence on an error, and the exit code."""
+    from uwsfm._last_words import is_out_of_memory, unexpected
+
+    if isinstance(error, InputError):
+        return str(error), WRONG_INPUT
+    if is_out_of_memory(error):
+        return (
+            "out of memory: give uwsfm more, or it less to do (smaller images, fewer "
+            "--threads, --submap-frames)",
+            FAILED,
+        )
+    if isinstance(error, UwsfmError):
+        return str(error), FAILED
+    if isinstance(error, OSError):
+        text = f"{error.strerror or error}: {error.filename or ''}"
+        return text.rstrip(": "), FAILED
+    from uwsfm import __version__
+
+    return unexpected(error, __version__), FAILED

@@ -16,6 +16,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from uwsfm._checksums import check_checksums
+from uwsfm.colmap_files import check_model_files, stray_track
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -49,6 +51,11 @@ class Model:
     def has_image(self, camera: int, frame: int) -> bool:
         """Whether a frame has an image of a camera."""
         return len(self.keypoints[camera][frame]) > 0
+
+    def image_names(self) -> list[str]:
+        """Of the images that are there, camera by camera."""
+        shape = len(self.rig.cameras), self.scene.num_frames
+        return [self.image_name(*p) for p in np.ndindex(shape) if self.has_image(*p)]
 
     def errors_px(self) -> Array:
         """True reprojection error of each observation (N,), NaN if invalid."""
@@ -242,16 +249,20 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model folder.
 
     Raises:
-        InputError: there is none, or it cannot be read.
+        InputError: there is none, it cannot be read, is damaged, was copied in part,
+            or has names of images that no file can have.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such COLMAP model folder")
+    check_checksums(path)
+    check_model_files(path)
     try:
         return pycolmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError, IndexError, MemoryError) as error:
-        cause = str(error).splitlines()[0][:80]
+    except (ValueError, RuntimeError, IndexError, MemoryError, OSError) as error:
+        stray = stray_track(path)
+        cause = str(error).partition("\n")[0][:80]
         raise InputError(
-            f"{path}: not a COLMAP model that can be read: a file is damaged, or one "
-            "of cameras, images, points3D (and rigs, frames of version 4) is missing "
-            f"({cause})"
+            stray
+            or f"{path}: not a COLMAP model that can be read: a file is damaged, or "
+            f"the files are of different models ({cause})"
         ) from None

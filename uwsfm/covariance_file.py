@@ -4,14 +4,14 @@ JSON, or .npz without pickle, with the keys ``names`` (K texts) and ``matrix`` (
 see `uwsfm.calibration.given_accuracy.NamedCovariance`.
 """
 
-import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from uwsfm._files import read_json
+from uwsfm._npz import read_npz
 from uwsfm.calibration.given_accuracy import NamedCovariance
 from uwsfm.errors import InputError
 
@@ -28,14 +28,11 @@ def read_covariance(path: Path) -> NamedCovariance:
     """
     if path.suffix not in (".json", ".npz"):
         raise InputError(f"{path.name} is neither .json nor .npz")
+    read = read_npz if path.suffix == ".npz" else read_json
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path} is too large for a covariance")
-        content = _npz(path) if path.suffix == ".npz" else _json(path)
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}") from None
-    except (OSError, EOFError, ValueError, RecursionError, zipfile.BadZipFile):
-        raise InputError(f"{path} is damaged, or no {path.suffix} file") from None
+        content = read(path, MAX_BYTES)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     try:
         return named_covariance(content)
     except InputError as error:
@@ -58,12 +55,3 @@ def named_covariance(content: Any) -> NamedCovariance:
     if not names:
         raise InputError("names: is empty")
     return NamedCovariance(names=tuple(names), matrix=matrix)
-
-
-def _json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _npz(path: Path) -> Mapping[str, Any]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}

@@ -25,8 +25,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
+from uwsfm._yaml import read_yaml
 from uwsfm.errors import InputError
-from uwsfm.rig_file import read_yaml
 from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import AccuracyEntry, Entry
 

@@ -22,6 +22,7 @@ frame (east-north-up, north-east-down, ...).
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +31,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
+from uwsfm._files import read_text
+from uwsfm._yaml import read_yaml
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig_file import read_yaml
 from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
@@ -40,10 +42,15 @@ HEADER = ["frame", "x", "y", "z", "sx", "sy", "sz"]
 
 # Single precision, as in PLY files, is a millimetre there.
 LARGEST_M = 1e4
+LARGEST_STDDEV_M = 1e6
+"""Of a position that is not known at all."""
+MAX_BYTES = 50_000_000
+"""Half a million positions."""
 # A dive is longer; in degrees this is two kilometres.
 SHORTEST_M = 0.02
 
-_Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+LARGEST_LENGTH_M = 1e6
+_Length = Annotated[float, Field(gt=0, le=LARGEST_LENGTH_M)]
 _TWO = Field(strict=False, min_length=2, max_length=2)
 _Pixel = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -125,21 +132,20 @@ def load_positions(path: str | Path) -> PositionTable:
     """
     path = Path(path)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if "".join(row).strip()]
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error):
+        text = read_text(path, MAX_BYTES)
+        rows = [row for row in csv.reader(io.StringIO(text)) if "".join(row).strip()]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except csv.Error:
         raise InputError(f"{path}: is not a table of text in UTF-8") from None
     _check_header(path, [cell.strip().lower() for cell in rows[0]] if rows else [])
-    frames, numbers = [], []
+    frames: dict[str, None] = {}
+    numbers = []
     for i, row in enumerate(rows[1:], 2):
         name, values = _row(f"{path}: row {i}", row)
         if name in frames:
             raise InputError(f"{path}: row {i}: frame {name!r} is given twice")
-        frames.append(name)
+        frames[name] = None
         numbers.append(values)
     if len(frames) < 3:
         raise InputError(
@@ -180,8 +186,11 @@ def _row(where: str, row: list[str]) -> tuple[str, list[float]]:
             raise InputError(f"{where}: {name}: {cell!r} is not a number") from None
         if not math.isfinite(value):
             raise InputError(f"{where}: {name}: {cell.strip()} is not finite")
-        if name.startswith("s") and not value > 0.0:
-            raise InputError(f"{where}: {name}: {value:g} m must be positive")
+        if name.startswith("s") and not 0.0 < value <= LARGEST_STDDEV_M:
+            raise InputError(
+                f"{where}: {name}: {value:g} m must be positive, and at most "
+                f"{LARGEST_STDDEV_M:g} m"
+            )
         values.append(value)
     return row[0].strip(), values
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from uwsfm._checksums import SUMS
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
@@ -25,7 +26,7 @@ from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 LOCK = "lock"
 HOUSING_SUMMARY = "calibration.json"
 """What `uwsfm calibrate` writes in the place of a model and its summary."""
-RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMMARY, PAGE, FOLDER)
+RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMS, SUMMARY, PAGE, FOLDER)
 """What a run writes."""
 
 

@@ -1,11 +1,12 @@
 """The folder that `uwsfm reconstruct`, `refine` and `demo` leave, read again."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uwsfm._checksums import write_checksums
+from uwsfm._files import read_json
 from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
@@ -19,6 +20,7 @@ from uwsfm.export.calibration_file import (
 )
 from uwsfm.export.files import (
     HOUSING,
+    MAX_SUMMARY,
     RIG_GIVEN,
     SPARSE,
     SUMMARY,
@@ -154,8 +156,8 @@ def told_of(path: Path) -> Mapping[str, Any]:
 def read_told(path: Path) -> Mapping[str, Any]:
     """What a JSON file that uwsfm wrote holds; empty if it is another's, or damaged."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        told = read_json(path, MAX_SUMMARY)
+    except InputError:
         return {}
     return told if isinstance(told, dict) else {}
 
@@ -179,9 +181,11 @@ def require_model(path: Path, folder: Path, advice: str) -> None:
 
 
 def store_calibration(calibration: CalibrationResult, out: Path) -> None:
-    """Write calibration.npz beside the model and the housing that are there."""
+    """Write calibration.npz beside the model and the housing that are there, and
+    their checksums."""
     mark = fingerprint_of(out)
     write_calibration(calibration, out / CALIBRATION, mark)
+    write_checksums(out, [*(out / SPARSE).iterdir(), out / HOUSING])
 
 
 def recorded_images(images: Path | None) -> str | None:

@@ -6,8 +6,6 @@ Whatever is wrong with a file ends in one sentence that names the file and the k
 from __future__ import annotations
 
 import math
-import re
-import reprlib
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -20,6 +18,7 @@ import yaml
 from pydantic import ValidationError
 
 from uwsfm._files import replaced_file
+from uwsfm._yaml import read_yaml
 from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
@@ -32,27 +31,6 @@ from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, checked_baseline
 FRESH_WATER = 1.333
 
 # ---- Reading ------------------------------------------------------------------------
-
-
-class _Loader(yaml.SafeLoader):
-    """Safe YAML that reads 1e-3 as a number and refuses a key given twice."""
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        node = super().compose_mapping_node(anchor)
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                problem = f"the key {key.value!r} is given twice"
-                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
-            seen.add(key.value)
-        return node
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -75,30 +53,6 @@ def load_rig(path: str | Path) -> Rig:
     finally:
         if token is not None:
             IMPLAUSIBLE_ALLOWED.reset(token)
-
-
-def read_yaml(path: Path) -> dict:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("there is no such file") from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError("is not a text file in UTF-8") from None
-    try:
-        data = yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}: " if mark else ""
-        hint = "; indent with spaces, not tabs" if "\\t" in str(error.problem) else ""
-        raise InputError(f"{where}not valid YAML: {error.problem}{hint}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"not valid YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(data, dict):
-        what = "is empty" if data is None else f"holds {reprlib.repr(data)}"
-        raise InputError(f"{what} instead of keys such as 'version: 1'")
-    return data
 
 
 def _to_rig(file: RigFile, folder: Path) -> Rig:

@@ -202,5 +202,5 @@ def _write_images(
         )
         shares.append(share)
         bgr = cv2.cvtColor(clear, cv2.COLOR_RGB2BGR)
-        write_image(folder / model.image_name(camera, frame), bgr)
+        write_image(folder, model.image_name(camera, frame), bgr)
     return float(np.mean(shares))

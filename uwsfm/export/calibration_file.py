@@ -14,7 +14,6 @@ rig_from_world, see `Covariance.frames`.
 import dataclasses
 import hashlib
 import json
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from uwsfm._files import replaced_file
+from uwsfm._npz import read_npz
 from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.lengths import (
     Distances,
@@ -131,8 +131,7 @@ def read_calibration(path: Path, scene: Scene, mark: str) -> CalibrationResult:
             f"all of it was copied; {RUN_AGAIN}"
         )
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = read_npz(path)
         about = json.loads(str(arrays["about"]))
         version, found = about["version"], about["fingerprint"]
     except _DAMAGE:
@@ -206,9 +205,8 @@ def _in_all(arrays: _Arrays, at_zero: Array) -> InAll | None:
     )
 
 
-_DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) + (
-    zipfile.BadZipFile,
-)
+_DAMAGE = (ValueError, LookupError, TypeError, AttributeError, RecursionError)
+"""What arrays of other shapes than those written raise where they are used."""
 
 
 def _damaged(path: Path) -> InputError:

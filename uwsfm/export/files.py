@@ -1,13 +1,13 @@
 """What a reconstruction leaves on disk, and how it is read back."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm._files import replaced_dir
+from uwsfm._checksums import check_checksums
+from uwsfm._files import read_json, replaced_dir
 from uwsfm._ply import write_ply
 from uwsfm.cloud import UNKNOWN_UNIT
 from uwsfm.colmap import (
@@ -30,6 +30,8 @@ SPARSE, HOUSING, POINTS, SUMMARY = (
 )
 RIG_GIVEN = "rig_given.yaml"
 """The rig file that a result was made with, every number as it was given."""
+MAX_SUMMARY = 100_000_000
+"""Bytes of summary.json: far more than that of a thousand dives."""
 WORK = "uwsfm-work"
 """Folder inside the output folder where the steps keep their results."""
 
@@ -44,6 +46,7 @@ def read_model(folder: str | Path) -> Model:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     reconstruction = read_reconstruction(folder / SPARSE)
+    check_checksums(folder / HOUSING)
     return from_reconstruction(reconstruction, load_rig(folder / HOUSING))
 
 
@@ -54,11 +57,11 @@ def read_summary(folder: str | Path) -> dict[str, Any] | None:
         InputError: it is damaged.
     """
     path = Path(folder) / SUMMARY
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError):
+    try:
+        summary = read_json(path, MAX_SUMMARY)
+    except InputError:
         summary = None
     if not isinstance(summary, dict):
         raise InputError(f"{path} is damaged: {RUN_AGAIN}")

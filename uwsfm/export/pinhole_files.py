@@ -147,8 +147,8 @@ def _warp_all(
         camera = model.scene.cameras[c]
         image = read_image(images / name, camera)
         maps, mask = warp_maps(camera, found.pinholes[c], found.depths[c][f])
-        write_image(folder / "images" / name, warp_image(image, maps))
-        write_image(folder / "masks" / f"{name}.png", np.uint8(255) * mask)
+        write_image(folder / "images", name, warp_image(image, maps))
+        write_image(folder / "masks", f"{name}.png", np.uint8(255) * mask)
         known[name] = float(np.mean(mask))
         progress("warping images", done, len(places))
     return known

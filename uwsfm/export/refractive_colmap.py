@@ -5,7 +5,9 @@ import tempfile
 from pathlib import Path
 
 from uwsfm._files import checked_target, replaced_dir
+from uwsfm._paths import shown, white_space_fault
 from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.errors import InputError
 from uwsfm.sfm.refractive_colmap import (
     CAMERAS,
     IMAGES,
@@ -28,9 +30,14 @@ def export_refractive_colmap(model: Model, folder: str | Path) -> None:
         folder: must not exist.
 
     Raises:
-        InputError: the folder exists or cannot be written.
+        InputError: the folder exists or cannot be written, or a name would be cut by
+            whoever reads the text.
     """
     target = checked_target(folder)
+    for name in model.image_names():
+        fault = white_space_fault(name)
+        if fault is not None:
+            raise InputError(f"cannot export {shown(name)!r}: its name {fault}")
     reconstruction = to_reconstruction(model)
     cameras = {
         index + 1: PortCamera(camera=reconstruction.cameras[index + 1], port=port)

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._files import replaced_file
+from uwsfm._paths import inside
 from uwsfm.errors import InputError
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.export.pinhole import img_from_virtual
@@ -93,19 +95,28 @@ def read_image(path: Path, camera: RefractiveCamera) -> Image:
     return image
 
 
-def write_image(path: Path, image: Image) -> None:
+def write_image(folder: Path, name: str, image: Image) -> None:
     """Write an image in the format of its suffix.
 
+    Args:
+        folder: where the images go.
+        name: of the model, with its folder: nothing outside of ``folder`` is written.
+        image: as OpenCV has it.
+
     Raises:
-        InputError: the format is unknown, or the file cannot be written.
+        InputError: the name leads out of the folder, the format is unknown, or the
+            file cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = inside(folder, name)
     options = []
     if path.suffix.lower() in (".jpg", ".jpeg"):
         options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    try:
-        written = cv2.imwrite(str(path), image, options)
-    except cv2.error:
-        written = False
-    if not written:
-        raise InputError(f"cannot write {path.name}: its format or the disk refuses")
+    with replaced_file(path) as partial:
+        try:
+            written = cv2.imwrite(str(partial), image, options)
+        except cv2.error:
+            written = False
+        if not written:
+            raise InputError(
+                f"cannot write {path.name}: its format or the disk refuses"
+            )

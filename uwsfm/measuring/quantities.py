@@ -76,8 +76,9 @@ def area(points: Array) -> Quantity:
     The plane is Newell's: the one on which the polygon's shadow is largest.
 
     Raises:
-        InputError: the corners lie on a line, or sides cross.
+        InputError: the corners lie on a line or are one place, or sides cross.
     """
+    _require_different(points)
     before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
     middle = points.mean(axis=0)
     values, axes = np.linalg.eigh((points - middle).T @ (points - middle))
@@ -116,6 +117,17 @@ def height(points: Array) -> Quantity:
         slope[1:] += (axis @ above) / (values[0] - value) * turn
     flatness = np.append(np.nan, offset @ normal)
     return Quantity(float(normal @ above), slope, flatness=flatness)
+
+
+def _require_different(points: Array) -> None:
+    """Refuse a polygon that comes back to a corner: it encloses nothing, or parts."""
+    _, first = np.unique(points, axis=0, return_index=True)
+    for again in sorted(set(range(len(points))) - set(first.tolist())):
+        before = int(np.argmax(np.all(points == points[again], axis=1)))
+        raise InputError(
+            f"corners {before + 1} and {again + 1} are one and the same place: give "
+            "every corner once, in the order around the area"
+        )
 
 
 def _require_no_crossing(flat: Array) -> None:

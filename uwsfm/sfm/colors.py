@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._files import replaced_file
+from uwsfm._paths import inside
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.scene import IndexArray, Scene
@@ -104,7 +105,7 @@ def pixel_colors(image: NDArray[np.uint8], xy: NDArray) -> Colors:
 
 
 def colors_path(colors_dir: Path, image_name: str) -> Path:
-    return colors_dir / f"{image_name}.npy"
+    return inside(colors_dir, f"{image_name}.npy")
 
 
 def write_colors(colors_dir: Path, image_name: str, colors: Colors) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uwsfm._paths import check_image_names
 from uwsfm.errors import InputError
 from uwsfm.rig import Rig
 
@@ -100,6 +101,7 @@ def find_frames(image_dir: Path, rig: Rig, min_num_frames: int = MIN_FRAMES) -> 
             for name in sorted(names - common, key=natural_key)
         ),
     )
+    check_image_names(image_dir, frames.image_names())
     for image_name in frames.image_names():
         # COLMAP's lists of image pairs are separated by spaces.
         if re.search(r"\s", image_name):

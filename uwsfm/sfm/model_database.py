@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from uwsfm._paths import check_image_names
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
@@ -77,6 +78,7 @@ def _read(
 ) -> ImageDatabase:
     folders = [camera.images for camera in rig.cameras]
     ids = {image.name: image.image_id for image in database.read_all_images()}
+    check_image_names(path, ids)
     places = {ids[name]: place for name, place in places_in_rig(list(ids), rig).items()}
     stray = sorted(name for name in ids if ids[name] not in places)
     names = sorted(

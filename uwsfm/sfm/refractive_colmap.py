@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pycolmap
 
+from uwsfm._files import read_text
 from uwsfm.colmap import read_reconstruction
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
@@ -27,6 +28,8 @@ from uwsfm.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.sfm.baseline import MAX_FRAMES, robust_average
 
 CAMERAS, IMAGES, POINTS = "cameras.txt", "images.txt", "points3D.txt"
+MAX_BYTES = 50_000_000
+"""Of ``cameras.txt``: a camera for each of half a million images."""
 _PORTS: dict[str, type[FlatPort] | type[DomePort]] = {
     "FLATPORT": FlatPort,
     "DOMEPORT": DomePort,
@@ -64,9 +67,7 @@ def read_refractive_cameras(path: str | Path) -> dict[int, PortCamera]:
         InputError: no such file, or the file and the line that cannot be understood.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
+    if not path.exists():
         hint = ""
         if path.with_suffix(".bin").is_file():
             hint = (
@@ -75,9 +76,11 @@ def read_refractive_cameras(path: str | Path) -> dict[int, PortCamera]:
                 "file (uwsfm init without --from) with the lenses in air and the "
                 "ports, and give both to uwsfm refine"
             )
-        raise InputError(f"{path}: no such file{hint}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        raise InputError(f"{path}: no such file{hint}")
+    try:
+        lines = read_text(path, MAX_BYTES).splitlines()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     found: dict[int, PortCamera] = {}
     for number, line in enumerate(lines, start=1):
         items = line.split()
@@ -151,8 +154,8 @@ def read_refractive_colmap(
         (Path(name) / CAMERAS).write_text(text, encoding="ascii")
         try:
             return read_reconstruction(Path(name)), cameras
-        except InputError:
-            raise InputError(f"{folder}: not a text model of COLMAP") from None
+        except InputError as error:
+            raise InputError(str(error).replace(name, str(folder))) from None
 
 
 def rig_of_refractive_colmap(path: str | Path) -> Rig:

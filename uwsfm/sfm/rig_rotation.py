@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import DomePort, FlatPort, Port
@@ -132,6 +133,9 @@ def scene_depths(
 
     Depth is the third coordinate in the camera's own frame, metres. A camera that
     shares no view takes the percentiles of all points of the others.
+
+    Raises:
+        InputError: no match has a point in front of its cameras.
     """
     seen: list[list[Array]] = [[] for _ in cameras]
     for pair in pairs:
@@ -144,6 +148,12 @@ def scene_depths(
         seen[a].append(points[in_front, 2])
         seen[b].append(rigid3.transform(b_from_a, points[in_front])[:, 2])
     everything = np.concatenate([depths for rows in seen for depths in rows])
+    if not len(everything):
+        raise InputError(
+            "the matches of the cameras' images give no point in front of the rig: do "
+            "the folders of the cameras hold the same pictures, or is cam_from_rig "
+            "that of another rig or inverted?"
+        )
     return np.stack(
         [
             np.percentile(np.concatenate(rows) if rows else everything, [10, 50, 90])

@@ -1,12 +1,12 @@
 """Simulated observations in one .npz file, readable with numpy alone."""
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import pycolmap
 
 from uwsfm._files import replaced_file
+from uwsfm._npz import read_npz
 from uwsfm.errors import InputError
 from uwsfm.models.port import port_from_row
 from uwsfm.models.refractive import RefractiveCamera
@@ -65,12 +65,26 @@ def read_observations(path: Path) -> SimulatedScene:
         InputError: the file is not there, or not such a file.
     """
     try:
-        with np.load(path) as file:
-            data = {name: file[name] for name in ARRAYS}
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+        return _simulated(read_npz(path))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        reason = str(error).partition("\n")[0]
         raise InputError(
-            f"{path}: not a file of simulated observations: {error}"
+            f"{path}: not a file of simulated observations: {reason}"
         ) from None
+
+
+def _simulated(data: dict[str, np.ndarray]) -> SimulatedScene:
+    shapes = {name: data[name].shape for name in ARRAYS}
+    num_cameras = len(data["camera_model"])
+    expected = {
+        "camera_size": (num_cameras, 2),
+        "camera_params": (num_cameras, *shapes["camera_params"][1:2]),
+        "port_rows": (num_cameras, 9),
+        "is_outlier": shapes["camera_idx"],
+    }
+    for name, shape in expected.items():
+        if shapes[name] != shape:
+            raise InputError(f"{name} has shape {shapes[name]}, expected {shape}")
     cameras = [
         RefractiveCamera(
             pycolmap.Camera(

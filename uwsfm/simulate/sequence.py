@@ -1,6 +1,5 @@
 """Rendered stereo sequences: images, the rig a user would start from, the truth."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -11,7 +10,9 @@ import cv2
 import numpy as np
 import pycolmap
 
+from uwsfm._checksums import write_checksums
 from uwsfm._files import replaced_dir
+from uwsfm._paths import inside
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
@@ -170,7 +171,7 @@ def render_sequence(
         dump_rig(nominal_rig(spec.rig), partial / "rig.yaml", rig_header(spec.rig))
         truth = json.dumps(truth_of(spec), indent=1)
         (partial / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        _write_checksums(partial)
+        write_checksums(partial, [p for p in partial.rglob("*") if p.is_file()])
 
 
 def rig_header(rig: Rig) -> str:
@@ -271,7 +272,7 @@ def _render_images(spec: SequenceSpec, folder: Path, progress: Progress) -> None
                 sensor=spec.sensor,
                 rng=np.random.default_rng([spec.seed, c, f]),
             )
-            path = folder / spec.rig.cameras[c].images / name
+            path = inside(folder, f"{spec.rig.cameras[c].images}/{name}")
             _write_jpeg(path, image, spec.jpeg_quality)
             done += 1
     progress("rendering", done, total)
@@ -289,13 +290,3 @@ def _write_jpeg(path: Path, image: np.ndarray, quality: int) -> None:
     ]
     if not cv2.imwrite(str(path), image[..., ::-1], settings):  # RGB -> BGR
         raise UwsfmError(f"{path}: could not be written")
-
-
-def _write_checksums(folder: Path) -> None:
-    """SHA256SUMS, as ``sha256sum --check`` reads it."""
-    lines = []
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            lines.append(f"{digest}  {path.relative_to(folder).as_posix()}\n")
-    (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")
