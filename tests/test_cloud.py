@@ -43,10 +43,34 @@ def test_open3d_reads_the_same(tmp_path: Path, rng: np.random.Generator, open3d)
     np.testing.assert_array_equal(read["num_views"].numpy()[:, 0], cloud.num_views)
 
 
+def _header(*lines: str) -> bytes:
+    head = ("ply", "format binary_little_endian 1.0", *lines, "end_header", "")
+    return "\n".join(head).encode()
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "cannot read"),
+        (None, "there is no such file"),
+        (_header("element vertex many"), "expected 'element NAME COUNT'"),
+        (_header("element vertex"), "expected 'element NAME COUNT'"),
+        (_header("element vertex -1"), "expected 'element NAME COUNT'"),
+        (_header(f"element vertex {2**63}"), "it is damaged"),
+        (
+            _header("element vertex 999999999999", "property float x"),
+            "holds 0 of its 999999999999",
+        ),
+        (
+            _header("element vertex 1", "property float \u00e9") + b"1234",
+            "no x",
+        ),
+        (
+            _header("element vertex 1", *["property float x"] * 2),
+            "x of vertex comes tw",
+        ),
+        (_header("element vertex 1", "property float"), "property 'float' of vertex"),
+        (_header(), "without vertices"),
+        (b"ply\nformat binary_little_endian 1.0\n", "no end_header within"),
         (b"solid\n", "not a PLY file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "little-endian"),
         (

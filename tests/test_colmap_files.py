@@ -1,13 +1,13 @@
 """COLMAP's files: cut, overwritten or ill named, they are refused before COLMAP reads
 them, which believes any count."""
 
-import struct
 import os
+import struct
 import subprocess
 import sys
 
 import pytest
-from command_line import one_sentence, run
+from command_line import one_sentence
 from hostile import CASES, copied, needs_cases, small_model, written
 
 import uwsfm

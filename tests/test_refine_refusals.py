@@ -154,7 +154,7 @@ def test_folders_without_a_usable_model_are_refused(dive, plain, tmp_path):
     shutil.copytree(plain, tmp_path / "cut")
     data = (plain / "images.bin").read_bytes()
     (tmp_path / "cut" / "images.bin").write_bytes(data[: len(data) // 2])
-    refused(tmp_path / "cut", "not a COLMAP model")
+    refused(tmp_path / "cut", "images.bin: is cut short or damaged")
     found = pycolmap.Reconstruction(str(plain))
     found.frames[1].rig_from_world.translation[0] = np.nan
     refused(

@@ -9,7 +9,9 @@ import pytest
 
 import uwsfm
 from uwsfm import InputError
+from uwsfm.export.calibration_file import read_calibration
 from uwsfm.output_folder import locked, made_of_files, output_folder
+from uwsfm.result_folder import fingerprint_of
 
 
 def assert_same(found, expected):
@@ -61,6 +63,24 @@ def _of_another_run(out):
     )
 
 
+def _of_another_run_without_sums(out):
+    (out / "SHA256SUMS").unlink()  # as earlier versions left it
+    _of_another_run(out)
+
+
+def _copied_in_part(out):
+    (out / "sparse" / "points3D.bin").write_bytes(b"")
+
+
+def _without_points(out):
+    (out / "sparse" / "points3D.bin").unlink()
+
+
+def _cut_housing(out):
+    text = (out / "housing.yaml").read_text().rstrip()
+    (out / "housing.yaml").write_text(text[:-1])  # still valid, a digit less
+
+
 def _of_another_format(out):
     with np.load(out / "calibration.npz") as file:
         arrays = dict(file)
@@ -92,7 +112,11 @@ def _without_model(out):
     [
         (_without_calibration, "calibration.npz is missing: an earlier version"),
         (_cut_short, "calibration.npz is damaged, or of another version"),
-        (_of_another_run, "is of another model than the one beside it"),
+        (_of_another_run, "housing.yaml is not the file that the run wrote"),
+        (_of_another_run_without_sums, "is of another model than the one beside it"),
+        (_copied_in_part, r"points3D.bin is not the file .* copied only in part"),
+        (_without_points, "points3D.bin is missing, but SHA256SUMS lists it"),
+        (_cut_housing, "housing.yaml is not the file that the run wrote"),
         (_of_another_format, "has format 9, this version of uwsfm reads 2"),
         (_of_another_size, "calibration.npz is damaged"),
         (_without_summary, "summary.json is missing: the run has not finished"),
@@ -107,6 +131,42 @@ def test_damaged_folders_are_told_in_one_sentence(dive_result, tmp_path, harm, w
     with pytest.raises(InputError, match=words) as error:
         uwsfm.open_result(out)
     assert "\n" not in str(error.value) and str(out) in str(error.value)
+
+
+def test_results_of_earlier_versions_have_no_checksums_and_open(dive_result, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    names = {line.split()[1] for line in (out / "SHA256SUMS").open()}
+    assert "housing.yaml" in names and "sparse/points3D.bin" in names
+    (out / "SHA256SUMS").unlink()
+    assert uwsfm.open_result(out).fingerprint
+
+
+def _wrong_shapes(out):
+    with np.load(out / "calibration.npz") as file:
+        arrays = dict(file)
+    for name, value in arrays.items():
+        harmed = np.zeros((2, 3)) if name != "about" else np.zeros(3)
+        if value.shape != harmed.shape:
+            yield {**arrays, name: harmed}
+        yield {other: array for other, array in arrays.items() if other != name}
+
+
+def test_calibrations_of_wrong_shapes_are_read_or_refused(dive_result, tmp_path):
+    """What is missing may be what a run did not make; nothing else may be raised."""
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    refused = 0
+    model = uwsfm.read_model(out)
+    mark = fingerprint_of(out)
+    for arrays in _wrong_shapes(out):
+        np.savez(tmp_path / "calibration.npz", **arrays)
+        try:
+            read_calibration(tmp_path / "calibration.npz", model.scene, mark)
+        except InputError as error:
+            assert "calibration.npz" in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 20
 
 
 def test_images_are_where_they_were_or_where_one_says(dive_result, tmp_path):

@@ -1,5 +1,6 @@
 """rig.yaml: what is written comes back, and every mistake is one clear sentence."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -296,11 +297,15 @@ def test_the_first_of_several_problems_is_told_and_the_others_counted(tmp_path):
         ("", "is empty instead of keys"),
         ("- a\n- b\n", "holds ['a', 'b'] instead of keys"),
         ("version: 1\nwater: {a: 1\ncameras: [}\n", "line 3: not valid YAML: "),
-        ("version: 1\n\twater: 2\n", "line 2: not valid YAML: found character '\\t'"),
+        ("version: 1\n\twater: 2\n", "spaces, not tabs"),
         ("version: 1\nwater: 2\nversion: 1\n", "line 3: not valid YAML: the key 'vers"),
         ("version: !!python/name:os.system x\n", "line 1: not valid YAML: could not"),
         ("version: 1\x00\n", "not valid YAML: unacceptable character"),
-        ("a: &a [*a]\n", "a: unknown key"),
+        ("a: &a [*a]\n", "line 1: not valid YAML: too many blocks within blocks"),
+        ("a: {{ x }}\n", "line 1: not valid YAML: the value of a is a placeholder"),
+        ("b:\n  ? [1, 2]\n  : 3\n", "line 2: not valid YAML: a key of b is a list"),
+        ("a: " + "[" * 100_000, "line 1: not valid YAML: exceeded maximum nesting"),
+        ("a: !!bool 7\n", "not valid YAML: '7'"),
         ("1: 2\n", "unknown key; the keys here are version"),
     ],
 )
@@ -349,3 +354,22 @@ def test_a_port_of_no_known_kind_is_told_by_its_type(tmp_path):
     ):
         with pytest.raises(InputError, match=sentence):
             _load(tmp_path, _edited(("cameras/0/port", value)))
+
+
+def test_aliases_that_grow_exponentially_are_refused(tmp_path):
+    names = "abcdefghij"
+    lines = ["a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    for before, name in zip(names, names[1:], strict=False):
+        lines.append(f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]")
+    _check_sentence(tmp_path, "\n".join(lines), "aliases of aliases")
+
+
+def test_what_is_far_too_long_for_a_rig_is_refused_unread(tmp_path):
+    _check_sentence(tmp_path, "# " + "x" * 10_000_000, "has 10.0 MB")
+
+
+def test_pipes_and_devices_are_not_waited_on(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for path in (tmp_path / "pipe.yaml", Path("/dev/zero")):
+        with pytest.raises(InputError, match=f"{path}: is a pipe or a device"):
+            load_rig(path)

@@ -257,7 +257,7 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
     check_checksums(path)
     check_model_files(path)
     try:
-        return pycolmap.Reconstruction(str(path))
+        model = pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError, MemoryError, OSError) as error:
         stray = stray_track(path)
         cause = str(error).partition("\n")[0][:80]
@@ -266,3 +266,27 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
             or f"{path}: not a COLMAP model that can be read: a file is damaged, or "
             f"the files are of different models ({cause})"
         ) from None
+    _check_poses(path, model)
+    return model
+
+
+FARTHEST = 1e9
+"""From the origin, in any unit: what is farther away is no place under water."""
+
+
+def _check_poses(path: Path, model: pycolmap.Reconstruction) -> None:
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        try:
+            pose = np.array(image.cam_from_world().params)
+        except RuntimeError:  # of an empty optional
+            raise InputError(
+                f"{path}: image {image.name} has no pose: its camera has none in its "
+                "rig; was the file of the rigs edited?"
+            ) from None
+        if not np.all(np.abs(pose) < FARTHEST):  # NaN as well
+            raise InputError(
+                f"{path}: the pose of image {image.name} is not finite, or farther "
+                f"than {FARTHEST:g} from the origin"
+            )

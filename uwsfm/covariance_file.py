@@ -50,7 +50,7 @@ def named_covariance(content: Any) -> NamedCovariance:
     names = [str(name) for name in np.ravel(content["names"])]
     try:
         matrix = np.array(content["matrix"], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError("matrix: must be rows of numbers, all of one length") from None
     if not names:
         raise InputError("names: is empty")

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm.colmap import read_reconstruction
+from uwsfm.colmap import FARTHEST, read_reconstruction
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -141,8 +141,6 @@ def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
     for image, (camera, name) in zip(images, places, strict=True):
         frame = index_of[name]
         pose = np.array(image.cam_from_world().params)
-        if not np.all(np.isfinite(pose)):
-            raise InputError(f"{folder}: the pose of image {image.name} is not finite")
         poses[camera, frame] = pose
         keypoints[camera][frame], seen = points.seen_by(image)
         lens = reconstruction.cameras[image.camera_id]
@@ -156,7 +154,10 @@ def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
     table = np.concatenate(rows)  # (N, 7)
     table = table[np.lexsort((table[:, 0], table[:, 1], table[:, 2]))]
     if not len(table):
-        raise InputError(f"{folder}: the model has no points that its images see")
+        raise InputError(
+            f"{folder}: the model has poses, but no points that its images see: make "
+            "them first, for instance with COLMAP's point_triangulator"
+        )
     if not np.isfinite(table[:, 6]).any():
         raise InputError(f"{folder}: every point lies behind the images that see it")
     index = table[:, :4].astype(np.int64)
@@ -187,6 +188,7 @@ class _Points:
         self.ids = np.array(sorted(reconstruction.points3D), dtype=np.uint64)
         found = [reconstruction.points3D[int(i)] for i in self.ids]
         self.xyz = np.array([point.xyz for point in found]).reshape(-1, 3)
+        self.xyz[np.any(np.abs(self.xyz) > FARTHEST, axis=1)] = np.nan
         colors = np.array([point.color for point in found], dtype=np.uint8)
         self.colors = colors.reshape(-1, 3)
 
@@ -200,7 +202,7 @@ class _Points:
         which = np.searchsorted(self.ids, ids)
         known = np.append(self.ids, 0)[which] == ids
         # Junk is no observation: a pixel or a point that is not a number.
-        known &= finite_rows(xy)
+        known &= finite_rows(xy) & np.all(np.abs(xy) < FARTHEST, axis=1)
         rows = np.nonzero(known)[0]
         return xy, (rows, which[rows].astype(np.int64), xy[rows])
 

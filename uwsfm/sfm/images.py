@@ -186,6 +186,25 @@ def read_color(path: Path) -> Any:
 def _read(path: Path, flags: int) -> Any:
     try:
         data = np.fromfile(path, dtype=np.uint8)
+        if not _chunks_fit(data.data):
+            return None
         return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except (OSError, cv2.error):  # cv2.error: an empty file
         return None
+
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def _chunks_fit(data: memoryview) -> bool:
+    """Whether the parts of a PNG are as long as they claim; OpenCV takes the memory
+    for four gigabytes, and seconds, before it finds out."""
+    at = len(_PNG)
+    if data[:at] != _PNG:
+        return True
+    while at + 8 <= len(data):
+        kind = bytes(data[at + 4 : at + 8])
+        at += 12 + int.from_bytes(data[at : at + 4], "big")  # length, kind, checksum
+        if kind == b"IEND":
+            return at <= len(data)
+    return False

@@ -120,9 +120,12 @@ def _parsed(items: list[str]) -> tuple[int, PortCamera]:
 
 def _integer(text: str) -> int:
     try:
-        return int(text)
+        number = int(text)
     except ValueError:
         raise InputError(f"{text!r} is not a whole number") from None
+    if not 0 <= number < 2**31:
+        raise InputError(f"{text} is neither an identifier nor a size in pixels")
+    return number
 
 
 def _number(text: str) -> float:
