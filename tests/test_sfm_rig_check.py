@@ -341,6 +341,15 @@ def test_a_notable_turn_is_reported(rig, pair):
     assert "'right'" in warning
 
 
+def test_one_picture_in_both_folders_has_no_depth(rig, pair):
+    """Equal pixels of cameras side by side: their rays never meet in front."""
+    same = replace(pair, xy_b=pair.xy_a)
+    cameras = [rig.refractive_cameras()[0]] * 2
+    poses = np.array([rigid3.IDENTITY, [0.0, 0.0, 0.0, 1.0, -0.2, 0.0, 0.0]])
+    with pytest.raises(InputError, match="hold the same pictures"):
+        scene_depths(cameras, poses, [same])
+
+
 def test_depths_are_those_of_the_scene(rig, dive, pair):
     """Within a few percent, though ports and rotations are only approximate."""
     poses = turned(rig, poses_of(rig), pair).cam_from_rig

@@ -116,7 +116,8 @@ def _header(start: bytes) -> tuple[list[str], int]:
 
 def _vertex_element(lines: list[str]) -> tuple[int, list[tuple[str, str]]]:
     """Number of the vertices, and name and kind of each of their properties."""
-    count, fields = -1, []
+    count = -1
+    fields: list[tuple[str, str]] = []
     for line in lines[2:]:
         words = line.split()
         if words[:1] == ["element"]:

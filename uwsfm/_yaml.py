@@ -35,7 +35,7 @@ _MISREAD = (
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class _Loader(_SafeLoader):  # type: ignore[misc]
+class _Loader(_SafeLoader):
     """Safe YAML that reads 1e-3 as a number."""
 
 
