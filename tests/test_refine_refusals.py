@@ -62,7 +62,7 @@ def smaller(rig):
     [
         (inverted, "cam_from_rig of 'right' is inverted"),
         (swapped, "'right' and 'left' are swapped"),
-        (turned, "does not fit the images|wrong by several degrees"),
+        (turned, "the rotation of 'right' is wrong by [89] degrees"),
         (elsewhere, r"image right/0000.jpg is in no folder of the rig \(left/, starb"),
         (smaller, "800 x 600 pixels there, camera 'right' of the rig has 400 x 300"),
     ],

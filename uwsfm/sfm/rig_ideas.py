@@ -133,13 +133,31 @@ def remedies(
     ideas = [_turned(item, _corrected(item, pair)) for item in undone]
     ideas += shift_ideas(rig, cam_from_rig, pair, shifted)
     given = Correction(code="", rig=posed, what="", remedy="")
-    found = _better([_turned(given, pair)], ideas)
+    as_given = _turned(given, pair)
+    found = _better([as_given], ideas)
     if any(idea.misfit <= CLEAN_MISFIT and idea.strain <= 1.0 for idea in found):
         return likely(found)
     ideas += zoom_ideas(posed, pair)
     ideas.sort(key=lambda idea: idea.badness(LEAST_MISFIT))
     moved = [_moved(idea) for idea in ideas[:SHORTLIST]]
-    return likely(_better([_moved(_turned(given, pair))], moved)) or likely(found)
+    moved = _better([_moved(as_given)], moved) or found
+    phrases = likely(moved)
+    least = min((idea.misfit for idea in moved), default=np.inf)
+    turned = _turned(given, pair, max_misfit=np.inf)
+    if phrases and turned.misfit <= SAME_MISFIT * max(least, LEAST_MISFIT):
+        phrases["rotation"] = _turn_words(turned)
+    return phrases
+
+
+def _turn_words(idea: _Idea) -> str:
+    """The rotation itself as the mistake: a turn explains the matches as well as what
+    moves the ports does, and nothing in them tells the two apart."""
+    name = idea.correction.rig.cameras[idea.pair.camera_b].name
+    return (
+        f"the rotation of {name!r} is wrong by "
+        f"{idea.strain * SAME_TURN_DEG:.0f} degrees: calibrate it anew, or give "
+        "baseline_m in place of cam_from_rig"
+    )
 
 
 def _better(given: Sequence[_Idea], ideas: Sequence[_Idea]) -> list[_Idea]:
@@ -256,8 +274,11 @@ def likely(ideas: Sequence[_Idea]) -> dict[str, str]:
     return dict(list(phrases.items())[:MAX_PHRASES])
 
 
-def _turned(correction: Correction, pair: PairMatches) -> _Idea:
-    """By how much the second camera must turn to fit its matches."""
+def _turned(
+    correction: Correction, pair: PairMatches, max_misfit: float = MAX_MISFIT
+) -> _Idea:
+    """By how much the second camera must turn to fit its matches, if before the turn
+    rays of the same point miss by no more than ``max_misfit`` radians."""
     rig = correction.rig
     assert rig.cam_from_rig is not None
     few = pair.thinned(IDEA_MATCHES)
@@ -266,7 +287,7 @@ def _turned(correction: Correction, pair: PairMatches) -> _Idea:
     b_from_a = relative_pose(rig.cam_from_rig, pair.camera_a, pair.camera_b)
     in_front, misfit = fit_of(*cameras, b_from_a, few.xy_a, few.xy_b)
     idea = _Idea(correction=correction, pair=pair, strain=np.inf, misfit=np.inf)
-    if in_front < CLEARLY_IN_FRONT or misfit > MAX_MISFIT:
+    if in_front < CLEARLY_IN_FRONT or misfit > max_misfit:
         return idea
     poses = np.stack([rigid3.IDENTITY, b_from_a])
     alone = replace(few, camera_a=0, camera_b=1)
