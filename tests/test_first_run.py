@@ -142,8 +142,10 @@ print(_jit.__file__, _jit.CACHE_DIR)
 
 @pytest.mark.slow
 def test_the_source_folder_as_working_folder_changes_nothing(tmp_path):
-    """README's first command: install a copy, and run it where the source lies. Compiled
-    by the source, kernels would be kept under its key, and compiled again."""
+    """README's first command: install a copy, and run it where the source lies.
+
+    Compiled by the source, kernels would be kept under its key, and compiled again.
+    """
     package = Path(uwsfm.__file__).resolve().parent
     installed = tmp_path / "site"
     shutil.copytree(package, installed / "uwsfm", copy_function=shutil.copy2)

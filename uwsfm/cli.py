@@ -48,7 +48,6 @@ app = typer.Typer(
     help="Refractive underwater Structure-from-Motion behind flat and dome ports.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
@@ -78,12 +77,13 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _global_options(
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show COLMAP's own log.")
+        bool, typer.Option("--verbose", "-v", help="Show what uwsfm.log receives, too.")
     ] = False,
     version: Annotated[
         bool,
         typer.Option(
             "--version",
+            "-V",
             help="Print the version.",
             is_eager=True,
             callback=_print_version,
