@@ -9,6 +9,7 @@ poses are then adjusted together with the radial distortion and the points.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,12 @@ MAX_FRAMES = 500  # each is compared with all the others
 MAX_SPREAD = 0.2
 """Frames that differ more from the median, in radians or as a fraction of the
 baseline, are left out."""
+MAX_MAPPED_FRAMES = 16
+"""Frames that the rig is derived from. Without a rig twice as many images have to be
+mapped on one core, adjusted together again and again; the rig is the same in all of
+them, and is refined with all frames later."""
+STEP = "rig from baseline_m: "
+"""Before the names of the steps, for the map that comes later has the same."""
 LOSS_SCALE_PX = 2.0
 """Where the robust loss of the adjustment sets in; see `_adjust`."""
 
@@ -55,13 +62,19 @@ def rig_from_baseline(
         frames: The images.
         rig: Two cameras, `Rig.cam_from_rig` None.
         options: As for the perspective start.
-        progress: Called with the steps "verifying" and "mapping".
+        progress: Called with the steps "verifying", "mapping" and "adjusting", after
+            `STEP`.
 
     Raises:
         UwsfmError: too few frames show both cameras in one model.
     """
+
+    def show(step: str, done: int, total: int | None) -> None:
+        progress(STEP + step, done, total)
+
     cameras = rig.refractive_cameras()
     pinholes = tuple(fit_virtual_pinhole(camera, None) for camera in cameras)
+    frames = connected_frames(features_path, frames, MAX_MAPPED_FRAMES)
     database_path = work_dir / "free.db"
     write_mapping_database(
         features_path,
@@ -71,10 +84,10 @@ def rig_from_baseline(
         pinholes,
         None,
         options,
-        progress,
+        show,
         model="RADIAL",
     )
-    models = map_images(database_path, frames, options, free=True, progress=progress)
+    models = map_images(database_path, frames, options, free=True, progress=show)
     relative = _relative_poses(models[0], frames)
     if len(relative) < MIN_FRAMES:
         raise UwsfmError(
@@ -82,9 +95,46 @@ def rig_from_baseline(
             f"{MIN_FRAMES} are needed to derive cam_from_rig from baseline_m: give "
             "cam_from_rig in rig.yaml"
         )
-    average = robust_average(relative[:: -(-len(relative) // MAX_FRAMES)])
+    average = robust_average(relative)
+    show("adjusting", 0, None)
     adjusted = _adjust(models[0], database_path, frames, average)
     return with_baseline(adjusted, pinholes, rig.baseline_m or 0.0)
+
+
+def connected_frames(features_path: Path, frames: Frames, count: int) -> Frames:
+    """As many frames, whose images have many matches with each other.
+
+    Grown from the pair of frames with the most, by the frame that adds the most; first
+    come frames whose own cameras match, for only these show the rig.
+
+    Args:
+        features_path: Database with raw matches.
+        frames: All there are; no more than ``count``: all of them.
+        count: How many to choose.
+    """
+    total = len(frames.names)
+    if total <= count:
+        return frames
+    with opened(features_path) as database:
+        frame_of = {
+            image.image_id: frames.names.index(image.name.rpartition("/")[2])
+            for image in database.read_all_images()
+        }
+        pairs, numbers = database.read_num_matches()
+    matches = np.zeros((total, total))
+    for pair, number in zip(pairs, numbers, strict=True):
+        a, b = (frame_of[i] for i in pycolmap.pair_id_to_image_pair(pair))
+        matches[a, b] += number
+        matches[b, a] += number * (a != b)
+    own = np.diag(matches).copy()
+    np.fill_diagonal(matches, 0.0)
+    ties = np.where(own[:, None] * own > 0.0, matches, 0.0)
+    chosen = sorted(divmod(int(np.argmax(ties)), total))
+    while len(chosen) < count:
+        gain = ties[chosen].sum(axis=0)
+        gain[chosen] = -1.0
+        chosen.append(int(np.argmax(gain)))
+    return replace(frames, names=tuple(frames.names[f] for f in sorted(chosen)))
 
 
 def _relative_poses(model: pycolmap.Reconstruction, frames: Frames) -> Array:
