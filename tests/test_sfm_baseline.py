@@ -89,3 +89,23 @@ def test_frames_that_match_each_other_and_in_themselves_are_chosen(survey):
             key=lambda pair: ties(*pair),
         )
     assert set(best) <= set(few.names)
+
+
+def test_all_frames_are_used_if_some_do_not_suffice(survey, tmp_path, monkeypatch):
+    """Of two frames no rig is taken, which three have to show."""
+    rig, frames, database = survey
+    monkeypatch.setattr(baseline, "MAX_MAPPED_FRAMES", 2)
+    unknown = replace(rig, cam_from_rig=None, baseline_m=0.2)
+    few = replace(frames, names=frames.names[:6])
+    steps: dict[str, int | None] = {}
+    poses = rig_from_baseline(
+        database,
+        tmp_path,
+        few,
+        unknown,
+        StartOptions(num_threads=1),
+        lambda step, done, total: steps.update({step: total}),
+    )
+    assert np.linalg.norm(rigid3.inverse(poses)[1, 4:]) == pytest.approx(0.2)
+    assert steps["rig from baseline_m, all frames: mapping"] == 12
+    assert list(steps)[0] == f"{STEP}verifying"
