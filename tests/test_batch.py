@@ -9,9 +9,10 @@ import pytest
 import yaml
 from sfm_scenes import reduced_images, reduced_rig
 
-from uwsfm.batch import LOG, run_batch
+from uwsfm.batch import run_batch
 from uwsfm.dives_file import load_dives
 from uwsfm.errors import InputError
+from uwsfm.job_log import LOG
 from uwsfm.rig_file import dump_rig
 from uwsfm.tasks import Workers
 

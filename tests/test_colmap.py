@@ -94,15 +94,21 @@ def test_ply_fields(model, tmp_path):
     ]
     assert names == [
         *("x", "y", "z", "red", "green", "blue"),
-        *("track_length", "reprojection_error_px", "depth_stddev_m"),
+        *("id", "track_length", "reprojection_error_px", "depth_stddev_m"),
     ]
-    kinds = ["<f4"] * 3 + ["u1"] * 3 + ["<i4", "<f4", "<f4"]
+    kinds = ["<f4"] * 3 + ["u1"] * 3 + ["<i4", "<i4", "<f4", "<f4"]
     rows = np.frombuffer(body, dtype=list(zip(names, kinds, strict=True)))
     assert len(rows) == model.scene.num_points
     np.testing.assert_allclose(  # stored in single precision
         np.stack([rows[axis] for axis in "xyz"], axis=1), model.scene.points, rtol=1e-6
     )
     np.testing.assert_allclose(rows["depth_stddev_m"], 2e-3, rtol=1e-6)
+    # The ids are COLMAP's, whose file has the same places.
+    export_colmap(model, tmp_path / "sparse")
+    stored = pycolmap.Reconstruction(str(tmp_path / "sparse")).points3D
+    for row in rows:
+        place = [row[axis] for axis in "xyz"]
+        np.testing.assert_allclose(stored[int(row["id"])].xyz, place, rtol=1e-6)
 
 
 def test_depth_stddev_is_along_the_line_of_sight(model):

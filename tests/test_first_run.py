@@ -129,3 +129,41 @@ def test_the_first_run_leaves_nothing_to_compile(tmp_path):
     text = output(start(LEFT, images, UWSFM_CACHE_DIR=cache))
     assert "first run only" in text
     assert text.split("compiled again:")[1].strip() == ""
+
+
+# What an installed command does first, from the folder of its script.
+INSTALLED = """
+from uwsfm.first_run import compile_kernels
+from uwsfm import _jit
+assert compile_kernels(2) > 1.0
+print(_jit.__file__, _jit.CACHE_DIR)
+"""
+
+
+@pytest.mark.slow
+def test_the_source_folder_as_working_folder_changes_nothing(tmp_path):
+    """README's first command: install a copy, and run it where the source lies.
+
+    Compiled by the source, kernels would be kept under its key, and compiled again.
+    """
+    package = Path(uwsfm.__file__).resolve().parent
+    installed = tmp_path / "site"
+    shutil.copytree(package, installed / "uwsfm", copy_function=shutil.copy2)
+    script = installed / "script.py"
+    script.write_text(INSTALLED)
+    paths = os.pathsep.join(
+        p for p in sys.path if p and Path(p).resolve() != package.parent
+    )
+    found = subprocess.run(
+        [sys.executable, script],
+        env={**os.environ, "PYTHONPATH": paths, "UWSFM_CACHE_DIR": str(tmp_path / "c")},
+        cwd=package.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    file, cache = found.stdout.split()
+    assert Path(file).is_relative_to(installed)
+    assert list(Path(cache).parent.iterdir()) == [Path(cache)]
+    assert len(list(Path(cache).rglob("*.nbc"))) > 100  # as in the test above

@@ -15,6 +15,7 @@ from uwsfm.demo import sample_dir
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import unit_vector
 from uwsfm.housing_pipeline import calibrate_housing
+from uwsfm.job_log import LOG
 from uwsfm.output_folder import HOUSING_SUMMARY
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
@@ -76,7 +77,7 @@ def test_a_colmap_model_gives_the_housing(dive, tmp_path, strategy, start):
     # The rig of a simulation is exact: nothing that was given can be wrong.
     assert [row["if"] for row in found["error_budget"]] == ["all of these together"]
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"housing.yaml", HOUSING_SUMMARY, "uwsfm-work"}
+    assert names == {"housing.yaml", HOUSING_SUMMARY, LOG, "uwsfm-work"}
 
 
 def test_refined_water_and_lenses_arrive_in_the_housing(dive, tmp_path):

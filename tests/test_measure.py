@@ -316,6 +316,21 @@ def test_command_line(dive_result, spots, tmp_path, capsys):
     assert "cm2" in capsys.readouterr().out
 
 
+def test_a_place_shows_how_far_its_point_is(dive_result, capsys):
+    """3 and 4 mm off in y and z: 5.0 mm; less than half of what points are apart."""
+    points = dive_result.result.model.scene.points
+    typed = ",".join(f"{v:.9f}" for v in points[11] + [0.0, 0.003, 0.004])
+    content = {"version": 1, "distances": [{"ends": [1, typed]}]}
+    found = uwsfm.measure(dive_result.out, content)
+    (item,) = found.measurements
+    assert item.value == pytest.approx(np.linalg.norm(points[0] - points[11]))
+    assert item.spots[0].moved_by is None
+    assert item.spots[1].moved_by == pytest.approx(0.005, rel=1e-5)  # as it was typed
+    console.print(measurement_table(found))
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "nearest point of the model, 12, 5 mm from (" in said
+
+
 AREA = {"areas": [{"name": "floor", "corners": [1, 5, 9]}]}
 
 

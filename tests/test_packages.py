@@ -11,7 +11,11 @@ from uwsfm.errors import MissingPackageError
 @pytest.mark.parametrize(
     ("source", "sentence"),
     [
-        (None, "a test needs the package strange: pip install 'uwsfm[inspect]'"),
+        (
+            None,
+            "a test needs the package strange: pip install '.[inspect]' in the "
+            "source folder of uwsfm",
+        ),
         ("import of_strange", "a test needs the package of_strange: pip install "),
         (
             "import ctypes; ctypes.CDLL('libstrange.so.1')",  # as Open3D loads its own

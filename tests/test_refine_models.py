@@ -20,6 +20,7 @@ from test_three_cameras import three_camera_rig
 import uwsfm
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3, unit_vector
+from uwsfm.job_log import LOG
 from uwsfm.output_folder import RESULTS, WORK
 from uwsfm.report.files import FOLDER, PAGE
 from uwsfm.rig import Rig
@@ -78,7 +79,7 @@ def test_self_calibrated_models_end_at_the_refractive_optimum(
         model.errors_px(), result.model.errors_px(), atol=1e-8
     )
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*RESULTS, WORK} - {PAGE, FOLDER}
+    assert names == {*RESULTS, WORK, LOG} - {PAGE, FOLDER}
     assert np.all(model.colors == [10, 20, 30])  # those of the model
     assert np.linalg.norm(model.scene.cam_from_rig[1, 4:]) == pytest.approx(0.2)
 

@@ -23,7 +23,7 @@ from uwsfm.report.gather import gather
 from uwsfm.report.left_files import left_files
 from uwsfm.report.page import page_of
 from uwsfm.report.tables import frame_stddevs
-from uwsfm.report.view import MAX_POINTS, view_of
+from uwsfm.report.view import MAX_POINTS, level_axes, view_of
 from uwsfm.report.words import deviation, rounded, verdict_of
 
 
@@ -64,11 +64,36 @@ def test_refine_writes_a_page_that_says_what_the_summary_says(dive_result):
     factor = payload_of(page)["scales"]["factor"]  # to compare cameras by eye
     cameras = len(payload_of(page)["residuals"])
     assert page.count(f"{factor} times as long in\nall maps") == cameras == 2
-    cloud = base64.b64decode(payload_of(page)["view"]["points"])
-    points = np.frombuffer(cloud, "<f4").reshape(-1, 3)
-    np.testing.assert_allclose(
-        points, dive_result.result.model.scene.points, rtol=0, atol=1e-6
-    )
+    view = payload_of(page)["view"]
+    drawn = np.frombuffer(base64.b64decode(view["points"]), "<f4").reshape(-1, 3)
+    scene = dive_result.result.model.scene
+    # Turned back, they are the model's, of a few metres in 32 bits.
+    points = drawn @ np.array(view["axes"]) + view["origin"]
+    np.testing.assert_allclose(points, scene.points, rtol=0, atol=1e-6)
+    ids = np.frombuffer(base64.b64decode(view["ids"]), "<u4")
+    np.testing.assert_array_equal(ids, np.arange(scene.num_points) + 1)
+
+
+def test_the_view_is_level():
+    """A slope of 50 degrees, 6 m by 1 m, and outliers: it becomes level, x along it."""
+    rng = np.random.default_rng(0)
+    across, along = rng.uniform(-0.5, 0.5, 2000), rng.uniform(-3.0, 3.0, 2000)
+    slope = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.87), np.sin(0.87)]])
+    points = np.column_stack([across, along]) @ slope
+    points[:200] += rng.uniform(-2.0, 2.0, (200, 3))
+    normal = np.array([0.0, np.sin(0.87), -np.cos(0.87)])  # to the cameras, here below
+    centers = np.array([[0.1, 0.0, 0.0], [-0.1, 0.5, 0.0]]) + 2.0 * normal
+    axes = level_axes(points, centers, np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) > 0.0
+    assert axes[2] @ normal > np.cos(1e-3)  # an exact plane, but for the outliers
+    assert abs(axes[0] @ slope[1]) > np.cos(0.05)  # these are in the spread
+    top = np.array([0.0, 0.0, 1.0])
+    row = np.outer(np.linspace(0.0, 1.0, 5), [1.0, 0.0, 0.0])  # no plane: the images'
+    np.testing.assert_allclose(level_axes(row, centers[:1], top)[2], top)
+    for places in (np.zeros((1, 3)), np.full((3, 3), np.nan)):
+        lone = level_axes(places, np.zeros((1, 3)), top)
+        np.testing.assert_allclose(lone @ lone.T, np.eye(3), atol=1e-12)
 
 
 def test_the_numbers_and_pictures_are_beside_it(dive_result):
@@ -202,7 +227,9 @@ def test_a_large_cloud_is_thinned_and_far_points_left_out(dive_result):
             replace(covariance, points=covariances),
         )
     assert len(view.points) == MAX_POINTS and view.num_all_points == len(points)
-    assert view.num_outlying == 20 and np.abs(view.points).max() <= 1.0
+    assert view.num_outlying == 20
+    np.testing.assert_allclose(view.points @ view.axes, points[view.point_idx])
+    assert view.point_idx.min() >= 25
 
 
 def test_far_worlds_keep_their_digits(dive_result):
@@ -218,9 +245,9 @@ def test_far_worlds_keep_their_digits(dive_result):
     covariance = dive_result.result.calibration.covariance
     here, there = (view_of(replace(model, scene=s), covariance) for s in (scene, moved))
     assert not np.any(here.origin)
-    as_drawn = there.points.astype(np.float32) + (there.origin - away)
+    as_drawn = there.points.astype(np.float32) @ there.axes + (there.origin - away)
     # Half a unit in the last place of 32 bits, for coordinates of a few metres.
-    np.testing.assert_allclose(as_drawn, here.points, atol=1e-6)
+    np.testing.assert_allclose(as_drawn, here.points @ here.axes, atol=1e-6)
 
 
 def test_what_other_commands_left_is_named(dive_result, tmp_path):

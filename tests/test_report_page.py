@@ -2,6 +2,7 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 from uwsfm.report.files import PAGE
@@ -11,23 +12,21 @@ pytestmark = pytest.mark.slow  # seconds per page: WebGL without a graphics card
 NO_CARD = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
-CORNERS = """
+SEEN = """
 (() => {
   const plot = document.querySelector("#cloud"), scene = plot._fullLayout.scene._scene;
   const { model, view, projection } = scene.glplot.cameraParams;
   const times = (m, v) => [0, 1, 2, 3].map(
     (row) => v.reduce((sum, value, k) => sum + m[4 * k + row] * value, 0));
-  const ranges = JSON.parse(document.getElementById("data").textContent).view.ranges;
-  return [...Array(8).keys()].map((n) => {
-    const corner = ranges.map((range, k) => scene.dataScale[k] * range[n >> k & 1]);
-    const seen = times(projection, times(view, times(model, [...corner, 1])));
-    return Math.min(
-      plot.clientWidth / 2 * (1 - Math.abs(seen[0]) / seen[3]),
-      plot.clientHeight / 2 * (1 - Math.abs(seen[1]) / seen[3]));
-  });
+  return plot.data.map((trace) => Array.from(trace.x, (_, i) => {
+    const place = ["x", "y", "z"].map((name, k) => scene.dataScale[k] * trace[name][i]);
+    const seen = times(projection, times(view, times(model, [...place, 1])));
+    return [plot.clientWidth / 2 * (1 + seen[0] / seen[3]),
+            plot.clientHeight / 2 * (1 - seen[1] / seen[3])];
+  }));
 })()
 """
-"""Pixels between the corners of the 3-D axes and the border."""
+"""Where Plotly draws the vertices of each trace, pixels from the left and the top."""
 
 
 @pytest.fixture(scope="module")
@@ -90,12 +89,44 @@ def test_it_draws_offline_on_every_screen(opened, request):
         "p => p.querySelector('svg.main-svg') !== null)"
     )
     assert opened.js("document.querySelector('#cloud canvas') !== null")
-    assert 45.0 < min(opened.js(CORNERS)) < 55.0  # room for labels, and no more
+    assert_fills_its_frame(opened)
+    lost = "[...document.querySelectorAll('.scroll')].filter("
+    lost += "e => e.scrollWidth > e.clientWidth).map(e => e.ariaLabel)"
+    assert opened.js(lost) == []  # no column off the right edge
     ink = opened.js("document.querySelector('#cost')._fullLayout.font.color")
     paper = opened.js("getComputedStyle(document.body).backgroundColor")
     bright = sum(int(value) for value in paper[4:-1].split(",")) > 3 * 128
     assert bright == (scheme == "light")
     assert (int(ink[1:3], 16) < 128) == bright
+
+
+def assert_fills_its_frame(opened):
+    """All that is drawn is in the frame, and touches a margin of 9 % of its shorter
+    side (the rest of what is drawn is thinned out: a few pixels); up is up."""
+    seen = [np.array(trace, dtype=float) for trace in opened.js(SEEN)]
+    size = opened.js("(({clientWidth: w, clientHeight: h}) => [w, h])(cloud)")
+    places = np.concatenate(seen)
+    places = places[np.isfinite(places).all(axis=1)]
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = min(*low, *(size - high)) / min(size)
+    assert margin == pytest.approx(0.09, abs=0.015)
+    # One side is filled, and the other has what is drawn in its middle.
+    assert np.max((high - low) / size) > 0.75
+    assert (low + high) / 2 == pytest.approx(np.array(size) / 2, abs=0.03 * max(size))
+    assert seen[-1][:, 1].max() < np.median(seen[0][:, 1])  # the cameras, the points
+
+
+@pytest.mark.parametrize("opened", [(1280, "light")], ids=str, indirect=True)
+def test_a_point_shows_its_id_and_its_place_in_the_world(opened, dive_result):
+    """To be typed: `uwsfm measure --from 12` or `--from X,Y,Z`."""
+    trace = "document.querySelector('#cloud').data[0]"
+    assert "text" in opened.js(f"{trace}.hovertemplate")
+    points = dive_result.result.model.scene.points
+    for index, label in enumerate(opened.js(f"{trace}.text")):
+        name, place = label.split("<br>")
+        assert name == f"point {index + 1}"
+        xyz = [float(number) for number in place.split(",")]
+        assert xyz == pytest.approx(points[index], abs=2e-4)  # four digits of metres
 
 
 @pytest.mark.parametrize("opened", [(1280, "light")], ids=str, indirect=True)

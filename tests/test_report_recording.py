@@ -46,7 +46,7 @@ def test_rays_bend_at_the_port_and_end_at_their_points(camera: RefractiveCamera,
 
 def test_a_missing_rerun_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingPackageError, match=r"rerun-sdk.*uwsfm\[rerun\]"):
+    with pytest.raises(MissingPackageError, match=r"rerun-sdk.*\.\[rerun\]"):
         write_recording(tmp_path)
 
 

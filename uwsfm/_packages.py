@@ -10,6 +10,8 @@ from uwsfm.errors import MissingPackageError
 _DISTRIBUTIONS = {"rerun": "rerun-sdk"}
 _LIBRARIES = {"open3d": "libusb-1.0-0 libgomp1 libgl1 libegl1 libx11-6"}
 """What apt calls the system libraries that a package needs."""
+_INSTALL = "pip install '.[{extra}]' in the source folder of uwsfm"
+"""Not by name: the package index may hold another project under it."""
 _NO_LIBRARY = re.compile(r"(\S+): cannot open shared object file")
 
 
@@ -40,7 +42,7 @@ def import_package(name: str, purpose: str, extra: str) -> ModuleType:
         elif isinstance(error, ModuleNotFoundError) and error.name is not None:
             module = error.name.partition(".")[0]
             found = _DISTRIBUTIONS.get(module, module)
-            missing = f"the package {found}: pip install 'uwsfm[{extra}]'"
+            missing = f"the package {found}: {_INSTALL.format(extra=extra)}"
         else:
             missing = f"the package {package}, but importing it failed: {error}"
         raise MissingPackageError(f"{purpose} needs {missing}") from error

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
-import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +13,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.dives_file import Dive, load_dives
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.job_checks import checked_rig
+from uwsfm.job_log import LOG, log_file
 from uwsfm.output_folder import output_folder
 from uwsfm.pipeline import reconstruct
 from uwsfm.sfm.images import find_frames
@@ -23,9 +21,6 @@ from uwsfm.tasks import LOCAL, Workers, require_threads
 from uwsfm.trust.verdict import Word
 
 logger = logging.getLogger(__name__)
-
-LOG = "uwsfm.log"
-"""In the output folder of each dive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,31 +115,11 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
     try:
         out = output_folder(dive.out, dive.images)
         out.mkdir(parents=True, exist_ok=True)
-        with _logged(out / LOG) as log:
-            log.info("dive %s, images %s", dive.name, dive.images)
-            try:
-                result = reconstruct(
-                    dive.rig,
-                    dive.images,
-                    out,
-                    num_threads=num_threads,
-                    progress=_StepLog(log),
-                    **dive.options,
-                )
-            except UwsfmError as error:
-                log.error("failed: %s", error)
-                raise
-            except Exception:
-                log.error("%s", traceback.format_exc())
-                raise
-            log.info("verdict: %s", result.verdict.verdict)
-            for item in result.verdict.reasons:
-                log.info("%s: %s", item.severity, item.text)
-            for one in result.summary["explanations"]:
-                log.info("cause: %s", one["text"])
-            for warning in result.summary["warnings"]:
-                log.info("note: %s", warning)
-            log.info("done")
+        with log_file(out / LOG):
+            logger.info("dive %s, images %s", dive.name, dive.images)
+            result = reconstruct(
+                dive.rig, dive.images, out, num_threads=num_threads, **dive.options
+            )
     except UwsfmError as error:
         reason = str(error)
     except MemoryError:
@@ -170,35 +145,3 @@ def cause_of(summary: Mapping[str, Any]) -> str | None:
     """What a summary names as the cause, or else the first reason of its verdict."""
     causes = [*summary["explanations"], *summary["reasons"]]
     return causes[0]["text"] if causes else None
-
-
-class _StepLog:
-    """Notes when a step begins and ends."""
-
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
-        self._step: str | None = None
-
-    def __call__(self, step: str, done: int, total: int | None) -> None:
-        if step != self._step:
-            self._log.info("%s", step)
-            self._step = step
-
-
-@contextmanager
-def _logged(path: Path) -> Iterator[logging.Logger]:
-    """What uwsfm logs in this process goes to the end of a file, and nowhere else."""
-    log = logging.getLogger("uwsfm")
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    level, propagate = log.level, log.propagate
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    log.propagate = False
-    try:
-        yield log.getChild(f"batch.{os.getpid()}")
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(level)
-        log.propagate = propagate
-        handler.close()

@@ -49,7 +49,6 @@ app = typer.Typer(
     help="Refractive underwater Structure-from-Motion behind flat and dome ports.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 app.add_typer(simulate_app, name="simulate")
 app.command()(export)
@@ -81,7 +80,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _global_options(
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show COLMAP's own log.")
+        bool, typer.Option("--verbose", "-v", help="Show what uwsfm.log receives, too.")
     ] = False,
     debug: Annotated[
         bool,
@@ -91,6 +90,7 @@ def _global_options(
         bool,
         typer.Option(
             "--version",
+            "-V",
             help="Print the version.",
             is_eager=True,
             callback=_print_version,

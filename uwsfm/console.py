@@ -8,23 +8,16 @@ from typing import Any
 
 from rich.console import Console
 from rich.padding import Padding
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.text import Text
 
+from uwsfm._progress import Progress
 from uwsfm._signals import (
     RESUMES,
     interruption_in,
     raise_on_signals,
     tell_interrupted,
 )
+from uwsfm.progress_display import display
 
 WIDE = 200
 """Columns of a file or a pipe, which nobody has to read in a window: a table loses no
@@ -42,7 +35,7 @@ errors = Console(stderr=True)
 
 
 class ProgressBars:
-    """Draws `uwsfm._progress.Progress` reports, one bar per step.
+    """Shows the progress of a command on standard error.
 
     A signal is an exception from its start on: what takes long to import comes after.
 
@@ -52,44 +45,18 @@ class ProgressBars:
 
     def __init__(self, left: str = RESUMES) -> None:
         self._left = left
-        self._progress = Progress(
-            SpinnerColumn(finished_text="[green]✓"),
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=errors,
-        )
-        self._tasks: dict[str, TaskID] = {}
+        self._display = display(errors)
 
-    def __enter__(self) -> ProgressBars:
+    def __enter__(self) -> Progress:
         raise_on_signals()
-        return self
+        return self._display
 
     def __exit__(self, _: object, failure: BaseException | None, *__: object) -> None:
-        if failure is None:
-            self._finish_others("")
-        if self._tasks:  # else a blank line would be drawn
-            self._progress.stop()
+        self._display.close(complete=failure is None)
         interruption = interruption_in(failure)
         if interruption is not None:
             tell_interrupted(self._left)
             raise interruption from None
-
-    def __call__(self, step: str, done: int, total: int | None) -> None:
-        if not self._tasks:
-            self._progress.start()  # not before: an early error stands alone
-        if step not in self._tasks:
-            self._finish_others(step)
-            self._tasks[step] = self._progress.add_task(step, total=total)
-        self._progress.update(self._tasks[step], completed=done, total=total)
-
-    def _finish_others(self, step: str) -> None:
-        """Steps run one after the other: a new one means that the last one is done."""
-        for name, task in self._tasks.items():
-            if name != step:
-                done = max(self._progress.tasks[task].completed, 1)
-                self._progress.update(task, completed=done, total=done)
 
 
 STYLES = {"fits": "bold green", "doubtful": "bold yellow", "does not fit": "bold red"}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ import numpy as np
 from filelock import FileLock
 from numba.core import config
 
+from uwsfm._children import module_command
 from uwsfm._jit import CACHE_DIR
 from uwsfm._progress import Progress, silent
 from uwsfm.geometry import rigid3
@@ -92,10 +92,8 @@ def _run_all(num_processes: int, watch: Callable[[], None]) -> bool:
 
 
 def _start(name: str) -> subprocess.Popen[str]:
-    paths = os.pathsep.join(path for path in sys.path if path)
     return subprocess.Popen(
-        [sys.executable, "-m", __name__, name],
-        env={**os.environ, "PYTHONPATH": paths},
+        module_command(__name__, name),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

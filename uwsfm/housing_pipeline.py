@@ -24,6 +24,7 @@ from uwsfm.export.summary import (
     write_json,
 )
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.job_log import job_log
 from uwsfm.judgement import Judgement, judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.output_folder import (
@@ -103,6 +104,7 @@ def calibrate_housing(
             or a port distance is asked of single stereo pairs.
         UwsfmError: the images could not be reconstructed; the message says why.
     """
+    asked = {**locals()}
     made_of = made_of_files(rig, source)
     rig = checked_rig(rig)
     if start not in get_args(Start):
@@ -164,8 +166,10 @@ def calibrate_housing(
     if found is not None:
         model = start_from_model(found, rig, front_end.scene_distance_m)
         known.check_names(rig, model.tracks.frame_names)
-    with locked(out):
-        return job.run(model)
+    with locked(out), job_log(out, "uwsfm calibrate", asked, progress) as log:
+        result = replace(job, progress=log.progress).run(model)
+        log.result(result.summary)
+        return result
 
 
 @dataclass(frozen=True)

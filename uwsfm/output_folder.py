@@ -8,7 +8,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from uwsfm._checksums import SUMS
-from uwsfm.errors import InputError
+from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
     HOUSING,
@@ -19,6 +19,7 @@ from uwsfm.export.files import (
     WORK,
     read_summary,
 )
+from uwsfm.job_log import LOG
 from uwsfm.report.files import FOLDER, PAGE
 from uwsfm.result_folder import read_told
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
@@ -107,10 +108,12 @@ def _made_by_us(out: Path) -> bool:
 def locked(out: Path) -> Iterator[None]:
     """Keep a second run out of the folder: both would write the same database.
 
-    The folders that a run made only to lock them go when it ends with nothing in them.
+    The folders that a run made only to lock them go when it ends with nothing in them
+    but its log, unless that holds the traceback of an error that no sentence explains.
     """
     work = out / WORK
     made = [folder for folder in (work, *work.parents) if not folder.exists()]
+    logged_before, told = (out / LOG).exists(), True
     try:
         work.mkdir(parents=True, exist_ok=True)
         lock = FileLock(work / LOCK)
@@ -121,11 +124,16 @@ def locked(out: Path) -> Iterator[None]:
         raise InputError(f"cannot write to {out}: {error.strerror}") from None
     try:
         yield
+    except Exception as error:
+        told = isinstance(error, UwsfmError)
+        raise
     finally:
         # Beside results the lock is the mark that they are ours.
         bare = made and not any((out / name).exists() for name in RESULTS)
-        bare = bare and list(work.glob("*")) == [work / LOCK]
+        bare = bare and told and list(work.glob("*")) == [work / LOCK]
         if bare:
+            if not logged_before:
+                (out / LOG).unlink(missing_ok=True)
             with suppress(OSError):  # Windows: the release removes it
                 (work / LOCK).unlink()
         lock.release()

@@ -31,6 +31,7 @@ from uwsfm.export.summary import (
 )
 from uwsfm.first_run import compile_kernels
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.job_log import job_log
 from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.output_folder import WORK, locked, made_of_files, output_folder
@@ -136,7 +137,8 @@ def reconstruct(
         InputError: An option, the rig file, images or output folder are not usable.
         UwsfmError: The images could not be reconstructed; the message says why.
     """
-    command = command_line("reconstruct", reconstruct, locals())
+    asked = {**locals()}
+    command = command_line("reconstruct", reconstruct, asked)
     rig_source, rig = rig, checked_rig(rig)
     require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
     made_of = made_of_files(rig_source, images)
@@ -161,7 +163,7 @@ def reconstruct(
     known.check_names(rig, frames.names)
     with Workers(scheduler):  # whether a scheduler answers, and has a worker
         pass
-    with locked(out):
+    with locked(out), job_log(out, command, asked, progress) as log:
         job = _Job(
             rig=rig,
             images=Path(images),
@@ -172,9 +174,11 @@ def reconstruct(
             command=command,
             made_of=made_of,
             report=report,
-            progress=progress,
+            progress=log.progress,
         )
-        return job.run()
+        result = job.run()
+        log.result(result.summary)
+        return result
 
 
 @dataclass(frozen=True)

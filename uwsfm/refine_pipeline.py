@@ -29,6 +29,7 @@ from uwsfm.export.summary import (
     versions,
 )
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.job_log import job_log
 from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
@@ -131,7 +132,8 @@ def refine_model(
             the rig contradicts the model; the message says what to change.
         UwsfmError: too little of the model agrees with the refractive one.
     """
-    command = command_line("refine", refine_model, locals())
+    asked = {**locals()}
+    command = command_line("refine", refine_model, asked)
     rig_source, rig = rig, checked_rig(rig)
     settings = CalibrateOptions.parsed({**rig_options(rig), **options})
     require_effect(settings)
@@ -156,7 +158,7 @@ def refine_model(
     known = KnownLengths.read(lengths, positions, lever_arm)
     known.check_names(rig, names)
     timings = {"reading and checking the model": time.perf_counter() - clock}
-    with locked(out):
+    with locked(out), job_log(out, command, asked, progress) as log:
         job = _Job(
             rig=rig,
             start=start,
@@ -167,10 +169,12 @@ def refine_model(
             command=command,
             made_of=made_of,
             report=report,
-            progress=progress,
+            progress=log.progress,
             timings=timings,
         )
-        return job.run(options)
+        result = job.run(options)
+        log.result(result.summary)
+        return result
 
 
 def _found(source: Path) -> FoundModel:

@@ -18,6 +18,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from uwsfm._children import SAFE_PATH, import_path
 from uwsfm._files import PARTIAL
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
@@ -34,7 +35,10 @@ RETRIES = 2
 """Of a task that fails for another reason than its input: a full disk, say."""
 CONNECT_SECONDS = 5
 ENDS_WITH_PARENT = """
-import os, signal, threading, time
+import os, signal, sys, threading, time
+
+def dask_setup(server):
+    sys.path[:] = {path!r}
 
 def watch():
     while os.getppid() == {parent}:
@@ -44,7 +48,7 @@ def watch():
 os.setpgrp()
 threading.Thread(target=watch, daemon=True).start()
 """
-"""What the processes of this machine run first.
+"""What the processes of this machine run first, for they import what this one does.
 
 A group of their own: Ctrl-C and `timeout` mean whole groups; this process is to end the
 others, in order, before they complain of each other. When it is killed, nobody does,
@@ -199,8 +203,8 @@ class Workers:
             "local_directory": scratch,
             "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
         }
-        preload = [ENDS_WITH_PARENT.format(parent=os.getpid())]
-        with _quiet_starts(), dask.config.set({"temporary-directory": scratch}):
+        preload = [ENDS_WITH_PARENT.format(parent=os.getpid(), path=import_path())]
+        with _careful_starts(), dask.config.set({"temporary-directory": scratch}):
             if sys.platform == "win32":  # where processes can only be spawned
                 cluster = LocalCluster(**common, **each)
             else:
@@ -330,7 +334,7 @@ def _call(packed: tuple[list[str], bytes]) -> Any:
     """
     paths, task = packed
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")  # tasks share the cores
-    sys.path.extend(path for path in paths if path not in sys.path)
+    sys.path.extend(path for path in paths if path and path not in sys.path)
     import numpy  # noqa: F401  before pycolmap, which unpickling may import
     from threadpoolctl import threadpool_limits
 
@@ -347,17 +351,19 @@ def _sees(path: str) -> bool:
 
 
 @contextmanager
-def _quiet_starts() -> Iterator[None]:
-    """Processes that are started tell errors only, from their first line on."""
-    name = "DASK_LOGGING__DISTRIBUTED"
-    before = os.environ.get(name)
-    os.environ[name] = "error"
+def _careful_starts() -> Iterator[None]:
+    """Processes that are started tell errors only, from their first line on, and
+    import nothing from the working folder."""
+    wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1"}
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
     try:
         yield
     finally:
-        del os.environ[name]
-        if before is not None:
-            os.environ[name] = before
+        for name, value in before.items():
+            del os.environ[name]
+            if value is not None:
+                os.environ[name] = value
 
 
 def _log_as_all_do() -> None:

@@ -219,6 +219,16 @@ def _demo(results: Results) -> Iterator[Outcome]:
                 measured=found[key],
                 note=disturbed(found),
             )
+    first = results.get("first-run", {})
+    if "cold_over_warm" in first:
+        yield Outcome(
+            what="`uwsfm demo` without a cache, over one with it",
+            target=1.9,
+            unit="x",
+            measured=first["cold_over_warm"],
+            note=f"{first['cold_demo_s']:.0f} s and {first['warm_demo_s']:.0f} s, "
+            "installed as a copy, in the source folder",
+        )
 
 
 def _python(results: Results) -> Iterator[Outcome]:

@@ -5,7 +5,7 @@
 
 The sample is rendered, so its floor, its water and its colours are known. Prints the
 tables of README.md and draws color.png and surface.png; files go to WORK. Needs
-'uwsfm[render,inspect]'.
+'.[render,inspect]'.
 """
 
 import argparse

@@ -4,7 +4,7 @@
 
 The rendered floor is known, so the depth of every pixel is: where its ray hits the
 mesh. It takes the place of the interpolated depth, and the difference in the virtual
-pixel is the error of the warped image. Needs 'uwsfm[render]'.
+pixel is the error of the warped image. Needs '.[render]'.
 """
 
 import argparse

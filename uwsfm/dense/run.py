@@ -25,6 +25,7 @@ from uwsfm.dense.views import load_image, neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.summary import write_json
+from uwsfm.job_log import job_log
 from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
 SUMMARY = "summary.json"
@@ -67,10 +68,15 @@ def dense_cloud(
         InputError: An option, the folder or an image is not usable.
         UwsfmError: No depth could be found; the message says why.
     """
+    asked = {**locals()}
     settings = _parsed(options)
     result = open_result(out, images)
-    with _Run(result, result.require_images(), settings, progress) as run:
-        return run.cloud()
+    source = result.require_images()
+    with job_log(result.folder, "uwsfm dense", asked, progress) as log:
+        with _Run(result, source, settings, log.progress) as run:
+            cloud = run.cloud()
+        log.result(cloud.summary)
+        return cloud
 
 
 def _parsed(options: dict[str, Any]) -> DenseOptions:

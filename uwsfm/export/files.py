@@ -94,8 +94,9 @@ def export_ply(
 ) -> None:
     """Write the points as a binary PLY.
 
-    Properties: x y z (float, metres, world), red green blue (uchar), track_length
-    (int), reprojection_error_px (float, mean true error) and depth_stddev_m (float).
+    Properties: x y z (float, metres, world), red green blue (uchar), id (int, of
+    COLMAP's model), track_length (int), reprojection_error_px (float, mean true error)
+    and depth_stddev_m (float).
 
     Args:
         model: what to write.
@@ -106,7 +107,8 @@ def export_ply(
     scene = model.scene
     fields: list[tuple[str, str]] = [(axis, "<f4") for axis in "xyz"]
     fields += [(color, "u1") for color in ("red", "green", "blue")]
-    fields += [("track_length", "<i4"), ("reprojection_error_px", "<f4")]
+    fields += [("id", "<i4"), ("track_length", "<i4")]
+    fields += [("reprojection_error_px", "<f4")]
     if points_cov is not None:
         fields.append(("depth_stddev_m", "<f4"))
     rows = np.zeros(scene.num_points, dtype=fields)
@@ -116,6 +118,7 @@ def export_ply(
         rows[color] = model.colors[:, index]
     count = np.bincount(scene.point_idx, minlength=scene.num_points)
     total = np.bincount(scene.point_idx, model.errors_px(), minlength=scene.num_points)
+    rows["id"] = np.arange(scene.num_points) + 1  # as `to_reconstruction` counts
     rows["track_length"] = count
     rows["reprojection_error_px"] = total / np.maximum(count, 1)
     if points_cov is not None:

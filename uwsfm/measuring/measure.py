@@ -346,6 +346,7 @@ def entry(item: Measurement, arbitrary: bool) -> dict[str, Any]:
             "xyz": point.tolist(),
             "stddev_m": float(stddev) if math.isfinite(stddev) else None,
             "num_images": spot.num_images,
+            "moved_by_m": spot.moved_by,
             "miss_px": spot.miss_px,
         }
         for spot, point, stddev in zip(

@@ -40,6 +40,9 @@ class Spot:
     miss_px: float | None = None
     """By which clicks miss each other: RMS, corrected for the place fitted."""
     note: str | None = None
+    moved_by: float | None = None
+    """From the place that was typed to the point that is meant by it, in the unit of
+    the model; None: no place was typed."""
 
 
 @dataclass(eq=False)
@@ -155,17 +158,18 @@ class Spotter:
         return Spot(pick, how, count), point
 
     def _of_place(self, pick: WorldPick) -> tuple[Spot, int | _Rays]:
-        row = self.surface.nearest(np.array(pick.xyz))
+        row, gap = self.surface.nearest(np.array(pick.xyz))
         if self.surface.is_model:
             how = f"nearest point of the model, {row + 1}"
-            return self._model_spot(pick, row, how)
+            spot, point = self._model_spot(pick, row, how)
+            return replace(spot, moved_by=gap), point
         assert self.surface.stddev is not None
         rays = self._seen(self.surface.points[row], float(self.surface.stddev[row]))
         how = (
             f"nearest point of {self.surface.name}; its deviation is predicted from "
             f"the rays of the {len(rays.xy)} images that see the place"
         )
-        return Spot(pick, how, len(rays.xy)), rays
+        return Spot(pick, how, len(rays.xy), moved_by=gap), rays
 
     def _seen(self, point: Array, stated: float = np.nan) -> _Rays:
         """A place by the images that see it, each as good as a feature."""

@@ -48,8 +48,8 @@ class Surface:
     def tree(self) -> cKDTree:
         return cKDTree(self.points)
 
-    def nearest(self, xyz: Array) -> int:
-        """Index of the point that a place means.
+    def nearest(self, xyz: Array) -> tuple[int, float]:
+        """Index of the point that a place means, and how far off it is.
 
         Raises:
             InputError: the place is not on the cloud.
@@ -61,7 +61,7 @@ class Surface:
                 f"the nearest point of {self.name} is {gaps[0]:.3g} m away, the points "
                 f"there {spacing:.2g} m from each other: copy the place from the cloud"
             )
-        return int(rows[0])
+        return int(rows[0]), float(gaps[0])
 
 
 @dataclass(frozen=True, eq=False)

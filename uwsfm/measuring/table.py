@@ -8,6 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from uwsfm.measuring.measure import Measurement, MeasureResult, bar_check
+from uwsfm.measuring.spots import Spot
 
 
 def measurement_table(result: MeasureResult) -> Table:
@@ -78,6 +79,17 @@ def _remarks(item: Measurement, arbitrary: bool) -> list[str]:
         rms = math.sqrt(float((item.flatness**2).mean()))
         off = f"{rms:.2g}" if arbitrary else f"{1e3 * rms:.2g} mm"
         found.append(f"corners {off} RMS off their plane")
-    hows = dict.fromkeys(spot.how for spot in item.spots if "model" not in spot.how)
-    found += [how for how in hows if not how.startswith("clicked in") or "depth" in how]
+    found += dict.fromkeys(filter(None, (_how(s, arbitrary) for s in item.spots)))
     return found + list(item.notes)
+
+
+def _how(spot: Spot, arbitrary: bool) -> str:
+    """How a spot was placed; empty where its pick says it all."""
+    if spot.moved_by is not None:
+        scale, unit = (1.0, "") if arbitrary else _small(spot.moved_by, False)
+        place, _, rest = spot.how.partition("; ")
+        away = f"{place}, {scale * spot.moved_by:.2g}{unit} from {spot.pick}"
+        return f"{away}; {rest}" if rest else away
+    if spot.how.startswith("clicked in one"):
+        return spot.how
+    return ""

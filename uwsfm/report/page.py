@@ -143,7 +143,11 @@ def cost_unit(summary: dict[str, Any]) -> str:
 def _view_caption(report: Report) -> str:
     view, parts = report.view, []
     shown, count = len(view.points), view.num_all_points
-    parts.append(f"{count} points; frusta run as the cameras' rays do in the water.")
+    parts.append(
+        f"{count} points; frusta run as the cameras' rays do in the water. z is up: "
+        "the plane through the points is level. Move the pointer to a point for its id "
+        "and its place in the world; uwsfm measure takes both."
+    )
     if shown + view.num_outlying < count:
         parts.append(f"{shown} of them, chosen at random, are drawn.")
     if view.num_outlying:
@@ -155,7 +159,7 @@ def _view_caption(report: Report) -> str:
         )
     if np.any(view.origin):
         place = ", ".join(f"{value:.0f}" for value in view.origin)
-        parts.append(f"Coordinates are relative to ({place}) {report.unit}.")
+        parts.append(f"The axes begin at ({place}) {report.unit} of the world.")
     return " ".join(parts)
 
 
@@ -282,16 +286,17 @@ def _view_payload(report: Report) -> dict[str, Any]:
         "frusta": [_packed(lines) for lines in view.frusta],
         "trajectory": _packed(view.trajectory),
         "names": [frame.name for frame in report.frames],
-        "sight": view.sight.tolist(),
-        "up": view.up.tolist(),
+        "ids": _packed(view.point_idx + 1, "<u4"),
+        "axes": view.axes.tolist(),
+        "origin": view.origin.tolist(),
         "ranges": np.stack([low, high], axis=1).tolist(),
         "aspect": (span / span.max()).tolist(),
     }
 
 
-def _packed(values: ArrayLike) -> str:
-    """32-bit floats, little-endian, as text."""
-    return base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")
+def _packed(values: ArrayLike, kind: str = "<f4") -> str:
+    """32-bit numbers, little-endian, as text."""
+    return base64.b64encode(np.asarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
 def _limits(values: ArrayLike) -> list[float]:

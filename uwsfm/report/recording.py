@@ -11,6 +11,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm._children import module_command
 from uwsfm._files import replaced_file
 from uwsfm._packages import import_package
 from uwsfm.colmap import Model
@@ -73,7 +74,7 @@ def show_recording(path: Path) -> bool:
     windowed = sys.platform in ("win32", "darwin")
     if not windowed and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
         return False
-    subprocess.Popen([sys.executable, "-m", "rerun", str(path)])
+    subprocess.Popen(module_command("rerun", str(path)))
     return True
 
 

@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.problem import Covariance
 from uwsfm.colmap import Model
+from uwsfm.errors import UwsfmError
 from uwsfm.export.files import depth_stddev
 from uwsfm.export.scene_ply import camera_lines
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.surface.level import level_by_plane
 
 MAX_POINTS = 100_000
 """More are thinned out at random: a browser turns so many smoothly."""
@@ -28,12 +30,19 @@ _FAR_ORIGIN = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What is drawn; lengths as in the model, relative to ``origin``."""
+    """What is drawn, in a level frame: x along the scene, z up; units of the model.
+
+    A place of the world is drawn at ``axes @ (place - origin)``.
+    """
 
     origin: Array
-    """(3,)"""
+    """(3,) in the world."""
+    axes: Array
+    """(3, 3) right-handed; rows: the axes of the view in the world."""
     points: Array
     """(P, 3)"""
+    point_idx: NDArray[np.int64]
+    """(P,) in the model, whose ids are larger by one."""
     colors: NDArray[np.uint8]
     """(P, 3) RGB"""
     error_px: Array
@@ -68,23 +77,54 @@ def view_of(model: Model, covariance: Covariance) -> View:
     kept = _thinned(shown)
     points = scene.points[kept]
     origin = _origin(np.concatenate([points, centers]))
+    tops = rigid3.rotate(world_from_rig, [0.0, -1.0, 0.0])
+    axes = level_axes(points, centers, _mean_direction(tops))
+
+    def drawn(places: Array) -> Array:
+        return (places - origin) @ axes.T
+
     step = -(-scene.num_frames // MAX_FRUSTA)
     return View(
         origin=origin,
-        points=points - origin,
+        axes=axes,
+        points=drawn(points),
+        point_idx=kept,
         colors=model.colors[kept],
         error_px=total[kept] / np.maximum(count[kept], 1),
         stddev_m=depth_stddev(model, covariance.points)[kept],
         num_all_points=scene.num_points,
         num_outlying=outlying,
-        frusta=tuple(
-            _frusta(model, c, step, origin) for c in range(len(scene.cameras))
-        ),
+        frusta=tuple(drawn(_frusta(model, c, step)) for c in range(len(scene.cameras))),
         frusta_step=step,
-        trajectory=centers - origin,
-        sight=_mean_direction(rigid3.rotate(world_from_rig, [0.0, 0.0, 1.0])),
-        up=_mean_direction(rigid3.rotate(world_from_rig, [0.0, -1.0, 0.0])),
+        trajectory=drawn(centers),
+        sight=axes @ _mean_direction(rigid3.rotate(world_from_rig, [0.0, 0.0, 1.0])),
+        up=axes @ _mean_direction(tops),
     )
+
+
+def level_axes(points: Array, centers: Array, top: Array) -> Array:
+    """Axes (3, 3) of a level view, as rows: up as in maps, x along the scene.
+
+    Args:
+        points: (P, 3).
+        centers: (F, 3) of the cameras, which are above the points.
+        top: (3,) unit, of the images: up where the points span no plane.
+    """
+    finite = points[finite_rows(points)]
+    try:
+        level = level_by_plane(finite, centers.mean(axis=0))
+        up = rigid3.rotate(rigid3.inverse(level.map_from_world), [0.0, 0.0, 1.0])
+    except UwsfmError:
+        up = top
+    spread = np.concatenate([finite, centers])
+    spread = spread - spread.mean(axis=0)
+    spread -= np.outer(spread @ up, up)
+    x = np.linalg.svd(spread, full_matrices=False)[2][0]
+    x -= (x @ up) * up
+    if not np.linalg.norm(x) > 0.5:  # all at one place, or on a plumb line
+        x = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
 
 
 def _shown_points(points: Array, centers: Array) -> tuple[NDArray[np.int64], int]:
@@ -116,7 +156,8 @@ def _origin(places: Array) -> Array:
     return np.round(middle)
 
 
-def _frusta(model: Model, camera: int, step: int, origin: Array) -> Array:
+def _frusta(model: Model, camera: int, step: int) -> Array:
+    """Polylines (V, 3) in the world, parted by rows of NaN."""
     scene = model.scene
     mine = scene.camera_idx == camera
     ranges = np.linalg.norm(scene.points_in_cam()[mine], axis=1)
@@ -131,7 +172,7 @@ def _frusta(model: Model, camera: int, step: int, origin: Array) -> Array:
         rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world)
     )
     drawn = [
-        rigid3.transform(world_from_cam[frame], strip) - origin
+        rigid3.transform(world_from_cam[frame], strip)
         for frame in range(0, scene.num_frames, step)
         if model.has_image(camera, frame)
     ]

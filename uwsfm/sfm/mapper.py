@@ -44,12 +44,13 @@ def map_images(
         options: Those of the mapping are used, and the seed.
         free: The database has no rig, and the cameras' distortion is refined.
         first_pair: Images (COLMAP's ids) to begin with; None: the mapper chooses.
-        progress: Called with the step "mapping", in frames.
+        progress: Called with the step "mapping", in frames, or images where these are
+            free; of several models in turn, the largest so far counts.
 
     Raises:
         UwsfmError: nothing could be reconstructed; says why, as far as it shows.
     """
-    num_registered = 0
+    num_registered = most = 0
     pipeline = _pipeline_options(options, frames, free)
     if first_pair is not None:
         pipeline.init_image_id1, pipeline.init_image_id2 = first_pair
@@ -57,11 +58,13 @@ def map_images(
 
     def began() -> None:
         nonlocal num_registered
-        num_registered = 1
+        num_registered = 0
+        went_on()
 
     def went_on() -> None:
-        nonlocal num_registered
+        nonlocal num_registered, most
         num_registered += 1
+        most = max(most, num_registered)
 
     def call(
         token: pycolmap.CancellationToken,
@@ -77,10 +80,8 @@ def map_images(
                 cancellation_token=token,
             )
 
-    total = len(frames.names)
-    models = run_watched(
-        call, lambda: progress("mapping", min(num_registered, total), total)
-    )
+    total = len(frames.names) * (len(frames.folders) if free else 1)
+    models = run_watched(call, lambda: progress("mapping", min(most, total), total))
     if not models:
         raise UwsfmError(_why_empty(mapping_path, frames))
     progress("mapping", total, total)

@@ -197,23 +197,55 @@
     const i = (k + 1) % 3, j = (k + 2) % 3;
     return a[i] * b[j] - a[j] * b[i];
   });
+  const sub = (a, b, by) => a.map((value, k) => value - by * b[k]);
   const unit = (v) => v.map((value) => value / Math.hypot(...v));
-  // From where all corners of the axes are in the frame, with room for their labels.
-  function distance(away) {
-    const right = unit(cross(view.up, away)), up = cross(away, right);
-    const width = element.clientWidth, height = element.clientHeight, room = 50;
+  // What is to be in the frame, in Plotly's units: the longest side of the axes is 1.
+  const longest = Math.max(...view.ranges.map(([low, high]) => high - low));
+  const drawn = [points, trajectory, ...frusta].flatMap((list) => {
+    const step = Math.ceil(list[0].length / 1000);
+    return Array.from({ length: Math.ceil(list[0].length / step) }, (_, i) => list.map(
+      (values, k) => (values[i * step] - (view.ranges[k][0] + view.ranges[k][1]) / 2) / longest));
+  }).filter((place) => place.every(Number.isFinite));
+  // From where all of it just is in the frame, with room for the labels of the axes: how
+  // far the eye is, what it looks at, and how much of the frame is filled.
+  function fitted(away) {
+    const up = unit(sub([0, 0, 1], away, away[2])), right = cross(up, away);
+    const width = element.clientWidth, height = element.clientHeight;
+    const room = 0.09 * Math.min(width, height);
     const slope = 2 * Math.tan(Math.PI / 8) / height; // per pixel: Plotly sees 45 degrees
     const wide = slope * (width / 2 - room), high = slope * (height / 2 - room);
-    const corners = [...Array(8).keys()].map(
-      (n) => view.aspect.map((side, k) => ((n >> k & 1) - 0.5) * side));
-    return Math.max(...corners.map((corner) => dot(corner, away)
-      + Math.max(Math.abs(dot(corner, right)) / wide, Math.abs(dot(corner, up)) / high)));
+    let center = [0, 0, 0], far = 0, area = 1;
+    for (let pass = 0; pass < 10; pass++) {
+      const seen = drawn.map((place) => sub(place, center, 1));
+      far = Math.max(...seen.map((place) => dot(place, away)
+        + Math.max(Math.abs(dot(place, right)) / wide, Math.abs(dot(place, up)) / high)));
+      area = 1;
+      for (const side of [right, up]) {
+        const places = seen.map((place) => dot(place, side) / (far - dot(place, away)));
+        const low = Math.min(...places), most = Math.max(...places);
+        center = sub(center, side, -far * (low + most) / 2);
+        area *= most - low;
+      }
+    }
+    return { away, far, center, area };
   }
+  // From above one of the long sides, turned so that the scene fills the frame.
   function firstCamera() {
-    const side = cross(view.sight, view.up);
-    const away = unit([0, 1, 2].map((k) => -view.sight[k] + 0.8 * view.up[k] + 0.5 * side[k]));
-    const far = distance(away), eye = away.map((v) => far * v);
-    return { eye: xyz(eye), up: xyz(view.up), center: xyz([0, 0, 0]) };
+    const turns = [...Array(13).keys()].map((k) => (k - 6) * Math.PI / 18);
+    const { away, far, center } = turns
+      .map((turn) => fitted(unit([Math.sin(turn), -Math.cos(turn), 0.55])))
+      .reduce((best, next) => next.area > best.area ? next : best);
+    return { eye: xyz(sub(center, away, -far)), up: xyz([0, 0, 1]), center: xyz(center) };
+  }
+  function hover() {
+    const ids = new Uint32Array(bytes(view.ids).buffer);
+    const span = Math.max(...view.ranges.map(([low, high]) => high - low));
+    const digits = Math.max(0, 4 - Math.floor(Math.log10(span)));
+    return Array.from(ids, (id, i) => {
+      const place = [0, 1, 2].map((k) => view.origin[k]
+        + view.axes.reduce((sum, row, a) => sum + row[k] * points[a][i], 0));
+      return `point ${id}<br>${place.map((v) => v.toFixed(digits)).join(",")}`;
+    });
   }
   function marker(color) {
     const base = { size: state.size, opacity: 1, line: { width: 0 } };
@@ -228,10 +260,11 @@
     return !state.hidden.has(name);
   }
   let camera = firstCamera();
+  const labels = hover();
   figure("cloud", (color) => {
     const traces = [{
-      type: "scatter3d", mode: "markers", ...xyz(points), marker: marker(color), hoverinfo: "skip",
-      visible: shown("points"),
+      type: "scatter3d", mode: "markers", ...xyz(points), marker: marker(color), text: labels,
+      hovertemplate: "%{text}<extra></extra>", visible: shown("points"),
     }];
     frusta.forEach((lines, k) => traces.push({
       type: "scatter3d", mode: "lines", ...xyz(lines), connectgaps: false, hoverinfo: "skip",
@@ -317,6 +350,23 @@
     event.preventDefault();
     look(moves[event.key]());
   });
+
+  // Where a table does not fit, each row is a list, whose values are named by the headings.
+  const tables = [...document.querySelectorAll(".scroll > table")].filter((table) => table.tHead);
+  for (const table of tables) {
+    const names = [...table.tHead.rows[0].cells].map(
+      (cell) => "bare" in cell.dataset ? "" : `${cell.textContent.trim()} `);
+    for (const cell of table.querySelectorAll("tbody td")) cell.dataset.label = names[cell.cellIndex];
+  }
+  function listWide() {
+    for (const table of tables) {
+      table.classList.remove("listed");
+      const { scrollWidth, clientWidth } = table.parentElement;
+      table.classList.toggle("listed", scrollWidth > clientWidth);
+    }
+  }
+  listWide();
+  window.addEventListener("resize", listWide);
 
   // Tables that sort.
   for (const table of document.querySelectorAll("table.sortable")) {
