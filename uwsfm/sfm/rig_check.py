@@ -178,8 +178,8 @@ def _may_be_ports(
     rig: Rig, cam_from_rig: Array, pair: PairMatches, found: Mapping[str, str]
 ) -> bool:
     """Whether the ports explain it as well as what was ``found``: a focal length looks
-    like a port distance, and a frame's motion like a tilt."""
-    similar = set(found) <= {"focal", "frames_shifted"}
+    like a port distance, and a turn of a camera or a frame's motion like a tilt."""
+    similar = set(found) <= {"focal", "frames_shifted", "rotation"}
     return similar and ports_explain(rig, cam_from_rig, pair)
 
 

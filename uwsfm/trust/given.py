@@ -95,9 +95,9 @@ def _common_factor(
     """The factor by which all port distances together left the rig file's.
 
     A baseline that is too long lengthens all of them, and nothing else checks it. The
-    factor is the generalised least squares estimate from all differences. Errors of
-    rulers that are assumed are taken as one and the same error, which is the careful
-    way: whoever misjudges one port misjudges the next one alike.
+    factor is that of `mean_factor`. Errors of rulers that are assumed are taken as one
+    and the same error, which is the careful way: whoever misjudges one port misjudges
+    the next one alike.
     """
     index = {camera.name: i for i, camera in enumerate(rig.cameras)}
     items = [
@@ -118,21 +118,50 @@ def _common_factor(
     assumed = np.array([not item.stated for item in items])
     rulers = np.diag(stddevs**2)
     rulers[np.ix_(assumed, assumed)] = np.outer(stddevs[assumed], stddevs[assumed])
-    given = np.array([item.given for item in items])
-    weights = np.linalg.solve(images + rulers, given)
-    weights /= weights @ given
-    differences = np.array([item.estimate - item.given for item in items])
+    factor, of_images, of_rulers = mean_factor(
+        np.array([item.given for item in items]),
+        np.array([item.estimate for item in items]),
+        images,
+        rulers,
+    )
     return [
         Departure(
             camera=", ".join(item.camera for item in items),
             what="distances_share",
             given=1.0,
-            estimate=1.0 + float(weights @ differences),
-            stddev=math.sqrt(weights @ images @ weights),
-            given_stddev=math.sqrt(weights @ rulers @ weights),
+            estimate=factor,
+            stddev=of_images,
+            given_stddev=of_rulers,
             stated=not bool(assumed.any()),
         )
     ]
+
+
+def mean_factor(
+    given: Array, estimates: Array, images: Array, rulers: Array
+) -> tuple[float, float, float]:
+    """The factor between given and estimated numbers, and its standard deviations.
+
+    It is a mean, weighted as if all errors were independent; its deviations are those
+    of the correlated ones. Weights of generalised least squares turn negative where
+    errors have much in common, and the factor then lies outside of all numbers' own.
+
+    Args:
+        given: (n,)
+        estimates: (n,)
+        images: (n, n) covariance of the estimates.
+        rulers: (n, n) covariance of what was given.
+
+    Returns:
+        The factor, its standard deviation from the images, and from the rulers.
+    """
+    weights = given / np.diag(images + rulers)
+    weights /= weights @ given
+    return (
+        float(weights @ estimates),
+        math.sqrt(weights @ images @ weights),
+        math.sqrt(weights @ rulers @ weights),
+    )
 
 
 def _port(
