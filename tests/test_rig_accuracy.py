@@ -189,9 +189,9 @@ REFUSED = {
     "translation of right needs x, y and z": {
         "shared": {"covariance": {"names": ["right.translation_x"], "matrix": [[1.0]]}}
     },
-    "accuracy.covariance: there is no file": {"shared": {"covariance": "none.json"}},
+    "none.json: there is no such file": {"shared": {"covariance": "none.json"}},
     "is neither .json nor .npz": {"shared": {"covariance": "rig.yaml"}},
-    "is damaged, or no .json file": {"shared": {"covariance": "broken.json"}},
+    "broken.json: is damaged, or no JSON file": {"shared": {"covariance": "broken.json"}},
     "needs the keys names and matrix": {"shared": {"covariance": "other.json"}},
     "is damaged, or no .npz file": {"shared": {"covariance": "pickled.npz"}},
 }

@@ -286,7 +286,8 @@ def _beyond(value: float, usual: float, step: float) -> float:
 
 
 def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]:
-    """Those that are clearly better, best first: one of each kind."""
+    """Those that are clearly better, one of each kind: best first, and before it what
+    leaves clearly smaller residuals."""
     better = [one for one in tried if base.total - one.total >= CLEAR]
     better.sort(key=lambda one: one.total)
     chosen: list[Tried] = []
@@ -295,6 +296,9 @@ def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]
             break
         if all(one.trial.code != other.trial.code for other in chosen):
             chosen.append(one)
+    # Of those that cannot be told apart, what the images say goes before what is usual.
+    limit = min((one.fit.rms_px for one in chosen), default=0.0) * (1.0 + CLEAR * UNIT)
+    chosen.sort(key=lambda one: (one.fit.rms_px > limit, one.total))
     return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
 
 

@@ -112,7 +112,9 @@ def _common_factor(
     cols = covariance.border_cols[cameras, border.DISTANCE]
     images = covariance.border[np.ix_(cols, cols)]
     # Correlations of the one estimate of the covariance, sizes of the larger.
-    larger = np.array([item.stddev for item in items]) / np.sqrt(np.diag(images))
+    sizes = np.sqrt(np.diag(images))
+    larger = np.array([item.stddev for item in items])
+    larger = np.divide(larger, sizes, out=np.ones_like(sizes), where=sizes > 0.0)
     images = images * np.outer(larger, larger)
     stddevs = np.array([item.given_stddev for item in items])
     assumed = np.array([not item.stated for item in items])
