@@ -191,7 +191,9 @@ REFUSED = {
     },
     "none.json: there is no such file": {"shared": {"covariance": "none.json"}},
     "is neither .json nor .npz": {"shared": {"covariance": "rig.yaml"}},
-    "broken.json: is damaged, or no JSON file": {"shared": {"covariance": "broken.json"}},
+    "broken.json: is damaged, or no JSON file": {
+        "shared": {"covariance": "broken.json"}
+    },
     "needs the keys names and matrix": {"shared": {"covariance": "other.json"}},
     "is damaged, or no .npz file": {"shared": {"covariance": "pickled.npz"}},
 }

@@ -57,11 +57,15 @@ def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, ...]]:
         ]
     tilts = tilts_of(camera)
     return [
-        (
-            "tilt x, y (deg)",
-            ", ".join(f"{value:+.3f}" for value, _, _ in tilts),
-            *(", ".join(_number(t[k], "{:.3f}") for t in tilts) for k in (1, 2)),
-            camera["normal_verdict"],
+        *(
+            (
+                f"tilt {axis} (deg)",
+                f"{value:+.3f}",
+                _number(images, "{:.3f}"),
+                _number(in_all, "{:.3f}"),
+                camera["normal_verdict"],
+            )
+            for axis, (value, images, in_all) in zip("xy", tilts, strict=True)
         ),
         *_paper_rows(camera),
         (
