@@ -8,12 +8,25 @@ from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.errors import InputError
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
+from uwsfm.trust.reason import DOES_NOT_FIT
 
 
 def checked_rig(rig: Rig | str | Path) -> Rig:
-    """A rig, or that of a rig file, whose lenses can be projected."""
+    """A rig, or that of a rig file, whose lenses can be projected.
+
+    Raises:
+        InputError: the file or a lens is wrong, or the rig is the estimate of a result
+            that does not fit its images.
+    """
+    file = ""
     if not isinstance(rig, Rig):
-        rig = load_rig(rig)
+        file, rig = f"{rig}: ", load_rig(rig)
+    if rig.verdict == DOES_NOT_FIT:
+        raise InputError(
+            f"{file}verdict: does not fit: this rig is the estimate of a result that "
+            "does not fit its images, so its numbers are wrong; find the mistake in "
+            "that result with uwsfm check, and start from the rig file of that"
+        )
     for camera, refractive in zip(rig.cameras, rig.refractive_cameras(), strict=True):
         try:
             _ = refractive.lens

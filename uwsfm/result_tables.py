@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uwsfm.console import STYLES
+from uwsfm.export.verdict_summary import WITHHELD
 from uwsfm.report.tables import lengths_note
 from uwsfm.report.words import tilts_of
 
@@ -309,7 +310,7 @@ def timings_table(timings: dict[str, float], earlier: Collection[str] = ()) -> T
 def _scale(scale: dict[str, Any]) -> str:
     """The verdict, and the standard deviations if there are any."""
     own, total = scale["relative_stddev"], scale["relative_stddev_in_all"]
-    if own is None or total is None:
+    if own is None or total is None or scale["verdict"] == WITHHELD:
         return scale["verdict"]
     return (
         f"{scale['verdict']}, ± {1e2 * total:.2g} % of every length in all "

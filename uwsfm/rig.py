@@ -83,6 +83,8 @@ class Rig:
     placement given, which must then be known."""
     accuracy: RigAccuracy = field(default_factory=RigAccuracy)
     """How well the shared numbers are known."""
+    verdict: str = "fits"
+    """On the result that it is the estimate of; see `uwsfm.trust.verdict`."""
 
     def __post_init__(self) -> None:
         self._check_cameras()

@@ -81,6 +81,7 @@ def _to_rig(file: RigFile, folder: Path) -> Rig:
         baseline_stddev_m=file.baseline_stddev_m,
         refine_cam_from_rig=file.refine_cam_from_rig,
         accuracy=accuracy,
+        verdict=file.verdict,
     )
     _check_accuracy(rig)
     return rig
@@ -177,6 +178,8 @@ def dump_rig(
         top["refine_cam_from_rig"] = rig.refine_cam_from_rig
     if estimated:
         top["estimated"] = True
+    if rig.verdict != "fits":
+        top["verdict"] = rig.verdict
     top |= _shared_accuracy(rig.accuracy)
     text = _commented(header_comment.splitlines()) + _yaml(top) + "cameras:\n"
     for i, camera in enumerate(rig.cameras):

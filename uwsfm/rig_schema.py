@@ -361,6 +361,7 @@ class RigFile(Entry):
     baseline_stddev_m: Annotated[_Number, Field(ge=0)] = 0.0
     refine_cam_from_rig: bool = True
     estimated: bool = False
+    verdict: Literal["fits", "doubtful", "does not fit"] = "fits"
     accuracy: _RigAccuracy = RigAccuracyEntry()
     cameras: Annotated[tuple[CameraEntry, ...], Field(strict=False)]
 

@@ -36,7 +36,8 @@ def export_housing(
         rig: As refined.
         path: The file.
         calibration: The result that it is of.
-        verdict: On that result; the comments say no more than it does.
+        verdict: On that result; the comments say no more than it does, and no job
+            takes what does not fit as given.
     """
     comments, header, arbitrary = {}, HEADER, False
     if calibration is not None:
@@ -49,7 +50,7 @@ def export_housing(
             camera.name: _comments(rig, calibration, index, verdict)
             for index, camera in enumerate(rig.cameras)
         }
-        rig = _with_accuracy(rig, calibration)
+        rig = replace(_with_accuracy(rig, calibration), verdict=verdict)
     dump_rig(
         rig,
         path,

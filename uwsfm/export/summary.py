@@ -162,7 +162,6 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
         "solver_iterations": summary.num_iterations,
         "solver_converged": summary.converged,
         "solves": [asdict(solve) for solve in summary.solves],
-        "housing_determined": calibration.covariance.determined,
         "scale": scale_summary(calibration),
     }
 

@@ -67,7 +67,11 @@ def verdict_line(summary: Mapping[str, Any]) -> str:
     if word != FITS:
         return f"Verdict: {word}, for {_count(len(summary['reasons']))}."
     word = summary["scale"]["verdict"]
-    metric = "" if word == ARBITRARY else f" Its scale is {word}."
+    metric = (
+        ""
+        if word == ARBITRARY
+        else (f" Its scale is {word}, as far as the given lengths are right.")
+    )
     return f"Verdict: fits. The model explains the images within their noise.{metric}"
 
 
