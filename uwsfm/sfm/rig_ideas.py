@@ -140,7 +140,9 @@ def remedies(
     ideas += zoom_ideas(posed, pair)
     ideas.sort(key=lambda idea: idea.badness(LEAST_MISFIT))
     moved = [_moved(idea) for idea in ideas[:SHORTLIST]]
-    moved = _better([_moved(as_given)], moved) or found
+    moved = _better([_moved(as_given)], moved)
+    if not likely(moved):
+        moved = found
     phrases = likely(moved)
     least = min((idea.misfit for idea in moved), default=np.inf)
     turned = _turned(given, pair, max_misfit=np.inf)
