@@ -140,6 +140,10 @@ def remedies(
     ideas += zoom_ideas(posed, pair)
     ideas.sort(key=lambda idea: idea.badness(LEAST_MISFIT))
     moved = [_moved(idea) for idea in ideas[:SHORTLIST]]
+    moved = [  # where no ports fit, a turn may
+        after if math.isfinite(after.misfit) else before
+        for before, after in zip(ideas, moved, strict=False)
+    ]
     moved = _better([_moved(as_given)], moved)
     if not likely(moved):
         moved = found
