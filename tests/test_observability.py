@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from uwsfm import calibrate, verdicts
-from uwsfm.calibration.observability import Geometry
+from uwsfm.calibration.error_budget import with_budget
+from uwsfm.calibration.given_accuracy import CameraAccuracy
+from uwsfm.calibration.observability import Geometry, distance_verdict
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
-from uwsfm.simulate.rigs import paper_rig
+from uwsfm.simulate.rigs import paper_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
 
 NAMES = ("left", "right")
@@ -92,3 +94,24 @@ def test_nothing_is_promised_where_a_direction_is_free():
     result = calibrate(scene, loss="l2", baseline_stddev_m=1e9)
     assert not result.covariance.determined
     assert "entirely free" in verdicts(result, NAMES)[-1]
+
+
+def test_a_port_named_alone_has_the_number_and_the_word_of_the_tables():
+    """A focal length known to 300 % leaves both distances open, one more than the
+    other: the weakest direction is nearly that of left, and holds most of right."""
+    rig = sample_rig()
+    wild = replace(rig.cameras[0], accuracy=CameraAccuracy(focal=3.0))
+    given = replace(rig, cameras=(wild, rig.cameras[1])).given_accuracy()
+    options = ObservationOptions(num_points=200, noise_px=0.2, seed=2)
+    dived = simulate_scene(rig, rich_motion(8), Relief(stddev=0.2), options)
+    result, budget = with_budget(calibrate(dived.scene, loss="l2", given=given))
+    sentences = verdicts(result, NAMES, budget)
+    judged = result.covariance.judged_cameras
+    for c, name in enumerate(NAMES):
+        distance = result.scene.ports[c].distance
+        word = distance_verdict(distance, judged[c], True)
+        begins = f"the port distance of {name} is {word}: standard deviation "
+        (sentence,) = [text for text in sentences if text.startswith(begins)]
+        said = float(sentence.removeprefix(begins).split(" mm")[0])
+        # Printed to a tenth of a millimetre.
+        assert said == pytest.approx(1e3 * judged[c].distance_stddev_m, abs=0.051)

@@ -140,6 +140,10 @@ def _with(row, column, value):
     return {"names": NAMES, "matrix": matrix.tolist()}
 
 
+def _one(name, variance):
+    return {"names": [name], "matrix": [[variance]]}
+
+
 REFUSED = {
     "cameras[0].accuracy.focal: must be at least 0": {"left": {"focal": -1e-3}},
     "cameras[0].accuracy.focal: must be a finite": {"left": {"focal": float("nan")}},
@@ -189,6 +193,27 @@ REFUSED = {
     "translation of right needs x, y and z": {
         "shared": {"covariance": {"names": ["right.translation_x"], "matrix": [[1.0]]}}
     },
+    # Limits: 0.1 of 1400 px, 45 degrees, and k1 that moves the corner, 0.787 from the
+    # centre at unit focal length, by 0.3 of that: 0.3 / 0.787^2.
+    "accuracy.covariance: the standard deviation of left.fx is 2000 px, and must be "
+    "less than 140;": {"shared": {"covariance": _one("left.fx", 4e6)}},
+    "the standard deviation of right.rotation_z is 1000 rad, and must be less than "
+    "0.785;": {"shared": {"covariance": _one("right.rotation_z", 1e6)}},
+    "the standard deviation of left.k1 is 0.5, and must be less than 0.485;": {
+        "shared": {"covariance": _one("left.k1", 0.25)}
+    },
+    "the standard deviation of right.translation_x is 0.2 m, and must be less than "
+    "0.157;": {
+        "shared": {
+            "covariance": {
+                "names": [f"right.translation_{axis}" for axis in "xyz"],
+                "matrix": np.diag([0.04, 1e-8, 1e-8]).tolist(),
+            }
+        }
+    },
+    "accuracy.lens_prior: correlated needs the accuracy of a lens": {
+        "shared": {"lens_prior": "correlated"}
+    },
     "none.json: there is no such file": {"shared": {"covariance": "none.json"}},
     "is neither .json nor .npz": {"shared": {"covariance": "rig.yaml"}},
     "broken.json: is damaged, or no JSON file": {
@@ -209,6 +234,22 @@ def test_impossible_accuracies_are_refused_in_one_sentence(tmp_path, words):
         load_rig(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ") and words in text and "\n" not in text
+
+
+def test_single_accuracies_of_a_lens_make_a_correlated_prior(tmp_path):
+    shared = {"lens_prior": "correlated"}
+    given = load_rig(_file(tmp_path, shared, {"focal": 2e-3})).given_accuracy()
+    lens = border.FIRST_LENS
+    block = given.block([(0, lens), (0, lens + 1)])
+    assert given.correlated_prior
+    np.testing.assert_allclose(block, 2.8**2 * np.array([[1, 0.99], [0.99, 1]]))
+
+
+def test_a_baseline_is_held_or_corrected_and_not_both():
+    accuracy = RigAccuracy(baseline_m=1e-3)
+    replace(sample_rig(), accuracy=accuracy)
+    with pytest.raises(InputError, match="baseline_stddev_m and accuracy.baseline_m"):
+        replace(sample_rig(), baseline_stddev_m=1e-3, accuracy=accuracy)
 
 
 @pytest.fixture(scope="module")

@@ -12,24 +12,28 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from uwsfm import UwsfmError, calibrate
+from uwsfm import calibrate
 from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.check_halves import check_halves, cross_validated
 from uwsfm.cli import app
 from uwsfm.cli_check import halves_table
+from uwsfm.errors import InputError
 from uwsfm.export.halves_summary import KEY, halves_numbers
 from uwsfm.export.summary import housing_summary
 from uwsfm.geometry import rigid3
+from uwsfm.judgement import judged_result
 from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.residuals import border
 from uwsfm.result_folder import given_rig, open_result
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
+from uwsfm.trust import halves as halves_module
+from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import IN_ORDER, INTERLEAVED, CrossValidation, cross_validate
-from uwsfm.trust.halves_reason import FAR_APART, halves_reasons
+from uwsfm.trust.halves_reason import FAR_APART, halves_reasons, untested_notes
 from uwsfm.trust.projections import projection_map
 from uwsfm.trust.shared_numbers import shared_numbers
 
@@ -316,5 +320,35 @@ def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
 
 def test_few_frames_are_refused_with_the_number_that_is_needed():
     few = calibrate(dive(num_frames=5).scene, loss="l2")
-    with pytest.raises(UwsfmError, match="has 5 frames: halves .* need 6 or more"):
+    with pytest.raises(InputError, match="has 5 frames: halves .* need 6 or more"):
         cross_validate(RIG, few)
+    (note,) = untested_notes(few, has_model=True)
+    assert "not tested by halves" in note and "5 frames, and halves need 6" in note
+
+
+def test_a_note_names_a_result_that_is_too_large_until_it_is_tested(
+    dive_result, monkeypatch
+):
+    result, given = open_result(dive_result.out), given_rig(dive_result.out)
+    assert untested_notes(result.calibration, has_model=True) == []
+    count = result.model.scene.num_observations
+    monkeypatch.setattr(halves_module, "LITTLE_WORK", count - 1)
+    used = Used(**result.summary["goodness"]["used"])
+    judged = judged_result(given, result.solved, used)
+    bare = {key: value for key, value in result.summary.items() if key != KEY}
+    large = judged.added_to({**bare, "warnings": []}, result.model.rig)
+    (note,) = [text for text in large["warnings"] if "not tested" in text]
+    assert f"{count:,} observations" in note
+    assert "; uwsfm check OUT --halves tests them" in note and KEY not in large
+    (other,) = untested_notes(result.calibration, has_model=False)
+    assert "uwsfm reconstruct or refine, and then uwsfm check OUT --halves" in other
+    found = cross_validate(given, result.solved)
+    after = cross_validated(replace(result, summary=large), given, found)
+    assert not any("not tested" in text for text in after["warnings"])
+
+
+def test_a_result_without_a_model_is_refused_as_wrong_input(tmp_path):
+    (tmp_path / "calibration.json").write_text("{}")
+    shown = CliRunner().invoke(app, ["check", str(tmp_path), "--halves"])
+    assert isinstance(shown.exception, InputError)
+    assert "is a result of uwsfm calibrate" in str(shown.exception)

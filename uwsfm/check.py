@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from uwsfm._progress import Progress, silent
-from uwsfm.errors import InputError
-from uwsfm.export.files import SPARSE
 from uwsfm.export.summary import write_json
 from uwsfm.result_folder import given_rig, open_result
 from uwsfm.trust.diagnosis import Explanation, diagnose, options_of
@@ -46,11 +44,6 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
     Raises:
         InputError: the folder is not such a one, or lacks the rig file as given.
     """
-    if (Path(out) / "calibration.json").is_file() and not (Path(out) / SPARSE).is_dir():
-        raise InputError(
-            f"{out} is a result of uwsfm calibrate, which names the cause itself and "
-            "keeps no model: check the result of uwsfm reconstruct or refine"
-        )
     result = open_result(out)
     rig = given_rig(result.folder)
     model, summary = result.model, result.summary

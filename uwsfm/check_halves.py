@@ -26,7 +26,7 @@ from uwsfm.result_folder import Result, given_rig, open_result
 from uwsfm.rig import Rig
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate
-from uwsfm.trust.halves_reason import halves_reasons
+from uwsfm.trust.halves_reason import halves_reasons, untested_notes
 from uwsfm.trust.verdict import judged, with_reasons
 
 
@@ -44,8 +44,8 @@ def check_halves(out: str | Path) -> dict[str, Any]:
         The comparison, as in ``summary.json`` under "cross_validation".
 
     Raises:
-        InputError: the folder is not such a one.
-        UwsfmError: there are too few frames, or no halves could be adjusted.
+        InputError: the folder is not such a one, or has too few frames.
+        UwsfmError: no halves could be adjusted.
     """
     result = open_result(out)
     if "goodness" not in result.summary:
@@ -79,6 +79,7 @@ def cross_validated(
     verdict = with_reasons(judged(given, now, used), halves_reasons(found))
     # Notes are sentences with numbers in them: those of before go, all others stay.
     old = housing_warnings(rig, result.calibration, budget, summary["verdict"])
+    old += untested_notes(result.calibration, has_model=True)
     new = housing_warnings(rig, now, budget, verdict.verdict)
     cameras = zip(housing_summary(rig, now), summary["cameras"], strict=True)
     numbers = {

@@ -14,7 +14,7 @@ from uwsfm.calibration.error_budget import BudgetRow
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
 from uwsfm.errors import InputError
-from uwsfm.export.files import HOUSING, SPARSE
+from uwsfm.export.files import HOUSING, HOUSING_SUMMARY, SPARSE
 from uwsfm.export.housing import export_housing
 from uwsfm.export.summary import (
     errors_summary,
@@ -28,7 +28,6 @@ from uwsfm.job_log import job_log
 from uwsfm.judgement import Judgement, judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.output_folder import (
-    HOUSING_SUMMARY,
     WORK,
     locked,
     made_of_files,
@@ -215,6 +214,7 @@ class _Job:
             used,
             self.progress,
             in_halves=self._reprojects and self.start != "pairs",
+            has_model=False,
         )
         return self._finish(judged, () if model is None else model.warnings)
 

@@ -16,7 +16,11 @@ from uwsfm.models.port import NoPort
 from uwsfm.rig import Rig
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate_if_cheap
-from uwsfm.trust.halves_reason import enlarged_notes, halves_reasons
+from uwsfm.trust.halves_reason import (
+    enlarged_notes,
+    halves_reasons,
+    untested_notes,
+)
 from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict, judged, with_reasons
 
 
@@ -33,6 +37,8 @@ class Judgement:
     halves: CrossValidation | None
     """None: too few frames, or too many observations to do it without being asked."""
     verdict: Verdict
+    untested: tuple[str, ...] = ()
+    """Why there are no halves, if that is worth a note."""
 
     @property
     def word(self) -> str:
@@ -48,7 +54,7 @@ class Judgement:
         notes = housing_warnings(rig, self.calibration, self.budget, self.word)
         scale = self.calibration.covariance.scale_stddev
         more: dict[str, Any] = {
-            "warnings": [*summary["warnings"], *notes],
+            "warnings": [*summary["warnings"], *notes, *self.untested],
             "error_budget": budget_summary(self.budget, scale),
         }
         if self.halves is not None:
@@ -63,6 +69,7 @@ def judged_result(
     progress: Progress = silent,
     *,
     in_halves: bool = True,
+    has_model: bool = True,
 ) -> Judgement:
     """Judge an optimum: with its error budget and, where that costs little, by halves.
 
@@ -72,10 +79,12 @@ def judged_result(
         used: how much of the input it has.
         progress: called with each step.
         in_halves: False: the frames hold what halves would differ in.
+        has_model: whether the model is stored with the result.
     """
     progress("judging the fit", 0, None)
     solved, budget = with_budget(calibration)
     halves = cross_validate_if_cheap(rig, solved) if in_halves else None
+    untested = untested_notes(solved, has_model=has_model) if in_halves else []
     shown = enlarged(solved, {} if halves is None else halves.enlarged)
     return Judgement(
         solved=solved,
@@ -83,6 +92,7 @@ def judged_result(
         budget=budget,
         halves=halves,
         verdict=with_reasons(judged(rig, shown, used), halves_reasons(halves)),
+        untested=tuple(untested),
     )
 
 

@@ -12,6 +12,7 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
     HOUSING,
+    HOUSING_SUMMARY,
     POINTS,
     RIG_GIVEN,
     SPARSE,
@@ -25,8 +26,6 @@ from uwsfm.result_folder import read_told
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
 LOCK = "lock"
-HOUSING_SUMMARY = "calibration.json"
-"""What `uwsfm calibrate` writes in the place of a model and its summary."""
 RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMS, SUMMARY, PAGE, FOLDER)
 """What a run writes."""
 

@@ -20,6 +20,7 @@ from uwsfm.export.calibration_file import (
 )
 from uwsfm.export.files import (
     HOUSING,
+    HOUSING_SUMMARY,
     MAX_SUMMARY,
     RIG_GIVEN,
     SPARSE,
@@ -90,6 +91,12 @@ def open_result(out: str | Path, images: str | Path | None = None) -> Result:
             damaged, the files are of different runs, or ``images`` lacks an image.
     """
     folder = Path(out)
+    if (folder / HOUSING_SUMMARY).is_file() and not (folder / SPARSE).is_dir():
+        raise InputError(
+            f"{folder} is a result of uwsfm calibrate, which names the cause of a "
+            "misfit itself and keeps no model: give the output of uwsfm reconstruct or "
+            "refine"
+        )
     model = read_model(folder)
     summary = read_summary(folder)
     if summary is None:

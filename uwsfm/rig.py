@@ -17,7 +17,7 @@ from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, UNIT_TOLERANCE
 if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
     import pycolmap
 
-    from uwsfm.calibration.given_accuracy import GivenAccuracy
+    from uwsfm.calibration.given_accuracy import GivenAccuracy, GivenCamera
     from uwsfm.models.port import Port
     from uwsfm.models.radial_undistortion import LensConversion
     from uwsfm.models.refractive import RefractiveCamera
@@ -121,6 +121,12 @@ class Rig:
                 f"and the baseline, {baseline:g} m"
             )
         accuracy = self.accuracy.baseline_m
+        if accuracy is not None and stddev > 0.0:
+            raise InputError(
+                "baseline_stddev_m and accuracy.baseline_m are both given: use "
+                "baseline_stddev_m for a baseline that the images may correct, "
+                "accuracy.baseline_m for one that is held, and leave the other out"
+            )
         if accuracy is not None and not accuracy < baseline:
             raise InputError(
                 f"accuracy.baseline_m: {accuracy:g} m should be less than the "
@@ -187,10 +193,15 @@ class Rig:
             InputError: an accuracy is of something that the rig does not have.
         """
         from uwsfm.calibration.given_accuracy import given_accuracy
+
+        return given_accuracy(self.cameras_as_given(), self.accuracy, self.baseline_m)
+
+    def cameras_as_given(self) -> tuple[GivenCamera, ...]:
+        """What the accuracies of each camera's numbers depend on."""
         from uwsfm.calibration.given_errors import camera_as_given
 
         poses = self.cam_from_rig
-        cameras = [
+        return tuple(
             camera_as_given(
                 item.name,
                 refractive,
@@ -200,8 +211,7 @@ class Rig:
             for c, (item, refractive) in enumerate(
                 zip(self.cameras, self.refractive_cameras(), strict=True)
             )
-        ]
-        return given_accuracy(cameras, self.accuracy, self.baseline_m)
+        )
 
     def with_geometry(self, cam_from_rig: ArrayLike, ports: Sequence[Port]) -> Rig:
         """This rig with new poses (C, 7) and ports (C); the baseline follows."""

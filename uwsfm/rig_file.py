@@ -23,10 +23,11 @@ from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
 from uwsfm.models.port import DomePort, NoPort
+from uwsfm.residuals import border
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import CameraEntry, RadialUndistortionLens, RigFile
-from uwsfm.rig_values import IMPLAUSIBLE_ALLOWED, checked_baseline
+from uwsfm.rig_values import ACCURACIES, IMPLAUSIBLE_ALLOWED, checked_baseline
 
 FRESH_WATER = 1.333
 
@@ -93,7 +94,37 @@ def _check_accuracy(rig: Rig) -> None:
 
     models = {camera.camera.model_name for camera in rig.cameras}
     if models <= set(SUPPORTED_MODELS):  # others are refused where they are used
-        rig.given_accuracy()
+        given = rig.given_accuracy()
+        _check_covariance(rig)
+        stated = ~given.assumed & (given.stddevs > 0.0)
+        if given.correlated_prior and not stated[:, border.LENS].any():
+            raise InputError(
+                "accuracy.lens_prior: correlated needs the accuracy of a lens, and "
+                "none is given: add accuracy.covariance, or focal, principal_point_px "
+                "and distortion to the accuracy of a camera, or leave lens_prior out"
+            )
+
+
+def _check_covariance(rig: Rig) -> None:
+    """Refuse standard deviations that no single accuracy may have."""
+    from uwsfm.calibration.given_accuracy import MAX_CORNER, named_unit
+
+    named = rig.accuracy.covariance
+    if named is None or IMPLAUSIBLE_ALLOWED.get():
+        return
+    cameras = rig.cameras_as_given()
+    for name, variance in zip(named.names, np.diag(named.matrix), strict=True):
+        own, stddev = named_unit(cameras, name), float(np.sqrt(variance))
+        most = MAX_CORNER
+        if own.key != "distortion":
+            most = ACCURACIES[own.key][0]
+        if stddev * own.factor >= most:
+            raise InputError(
+                f"accuracy.covariance: the standard deviation of {name} is "
+                f"{stddev:g} {own.unit}".rstrip()
+                + f", and must be less than {most / own.factor:.3g}; the matrix holds "
+                "variances, the squares of standard deviations"
+            )
 
 
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:

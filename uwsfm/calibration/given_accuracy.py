@@ -239,14 +239,12 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
             f"camera {camera.name!r}: accuracy.distortion has {len(given)} values, its "
             f"lens model has {len(coefficients) or 'no'} coefficients ({names})"
         )
-    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(lens[0])
-    powers = {slot: power for chain in _radial(camera) for slot, power in chain.items()}
+    radial = {slot for chain in _radial(camera) for slot in chain}
     for k, slot in enumerate(coefficients):
-        default = TANGENTIAL
-        if slot in powers:
-            default = CORNER / corner ** powers[slot]
+        reach = _corner_shift(camera, slot)
+        default = CORNER / reach if slot in radial else TANGENTIAL
         value = None if given is None else given[k]
-        moved = (value or 0.0) * corner ** powers.get(slot, 2)
+        moved = (value or 0.0) * reach
         if moved > MAX_CORNER:
             raise InputError(
                 f"camera {camera.name!r}: accuracy.distortion[{k}] is {value:g}, which "
@@ -254,6 +252,53 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
                 "from the centre; it is one standard deviation of the coefficient"
             )
         _set(stddevs, assumed, first + slot, value, default)
+
+
+def _corner_shift(camera: GivenCamera, slot: int) -> float:
+    """How far one unit of a coefficient moves the image corner, as a share of its
+    distance from the centre."""
+    powers = {slot: power for chain in _radial(camera) for slot, power in chain.items()}
+    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[0])
+    return corner ** powers.get(slot, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedUnit:
+    """The unit of a parameter in a covariance, beside that of a single accuracy."""
+
+    unit: str
+    """In the covariance: "px", "rad", "m", or "" for coefficients."""
+    key: str
+    """Of the accuracy that a person would state for it."""
+    factor: float
+    """How much one ``unit`` is in the unit of ``key``; of "distortion": the share by
+    which it moves the image corner."""
+
+
+def named_unit(cameras: Sequence[GivenCamera], name: str) -> NamedUnit:
+    """What a standard deviation of a covariance's parameter compares with.
+
+    A translation turns the baseline, or makes it longer by as much.
+
+    Args:
+        cameras: in the rig's order.
+        name: CAMERA.PARAMETER, one of those that `given_accuracy` takes.
+    """
+    camera_name, _, parameter = name.rpartition(".")
+    camera = next(one for one in cameras if one.name == camera_name)
+    if parameter.startswith("rotation_"):
+        factor = float(np.degrees(1.0))
+        return NamedUnit(unit="rad", key="rotation_deg", factor=factor)
+    if parameter.startswith("translation_"):
+        factor = float(np.degrees(1.0) / np.linalg.norm(camera.translation))
+        return NamedUnit(unit="m", key="direction_deg", factor=factor)
+    slot = camera.slots[camera.param_names.index(parameter)]
+    if slot < 2:
+        return NamedUnit(unit="px", key="focal", factor=1.0 / float(camera.lens[slot]))
+    if slot < 4:
+        return NamedUnit(unit="px", key="principal_point_px", factor=1.0)
+    factor = _corner_shift(camera, slot)
+    return NamedUnit(unit="", key="distortion", factor=factor)
 
 
 def _port(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> None:

@@ -199,20 +199,26 @@ def _distances(
     grow = reported / np.sqrt(np.diag(block))
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
     ports = [result.scene.ports[c] for c in free]
-    typical = float(np.mean([p.distance for p in ports if isinstance(p, FlatPort)]))
+    sizes = [p.distance for p in ports if isinstance(p, FlatPort)]
+    typical = float(np.mean(sizes))
     unit = small_unit(covariance.scale_stddev)
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        strong = _strong(vector)
         # Of one distance, not of the unit vector that several share.
-        share = np.abs(vector[_strong(vector)]).mean()
+        share = np.abs(vector[strong]).mean()
         stddev = float(share * np.sqrt(max(value, 0.0)))
-        word = _verdict(stddev, WEAK_SHARE * typical, typical)
+        size = typical
+        if np.count_nonzero(strong) == 1:  # as in the tables: other directions, too
+            alone = int(np.argmax(strong))
+            stddev, size = float(reported[alone]), abs(sizes[alone])
+        word = _verdict(stddev, WEAK_SHARE * size, size)
         if word == "determined":
             continue
         what, each = _direction(vector, [names[int(c)] for c in free])
         camera = int(free[int(np.argmax(np.abs(vector)))])
         own = _verdict(
-            covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * typical, typical
+            covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * size, size
         )
         cause = causes.given(own, lambda shift: abs(shift.distance_m), camera)
         known = f"{1e3 * stddev:.1f} {unit}{each}"

@@ -30,6 +30,8 @@ SPARSE, HOUSING, POINTS, SUMMARY = (
 )
 RIG_GIVEN = "rig_given.yaml"
 """The rig file that a result was made with, every number as it was given."""
+HOUSING_SUMMARY = "calibration.json"
+"""What `uwsfm calibrate` writes in the place of a model and its summary."""
 MAX_SUMMARY = 100_000_000
 """Bytes of summary.json: far more than that of a thousand dives."""
 WORK = "uwsfm-work"

@@ -17,7 +17,7 @@ from scipy.stats import f as f_distribution
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.propagation import Propagation
-from uwsfm.errors import UwsfmError
+from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
@@ -113,11 +113,20 @@ class CrossValidation:
         return found
 
 
-def costs_little(calibration: CalibrationResult) -> bool:
-    """Whether a cross-validation is worth its time without being asked for."""
+def num_frames(calibration: CalibrationResult) -> int:
+    """How many frames have observations that count."""
+    return len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
+
+
+def why_not_halved(calibration: CalibrationResult) -> str | None:
+    """Why a result is not cross-validated without being asked; None if it is."""
     count = int(np.count_nonzero(calibration.inliers))
-    frames = len(np.unique(calibration.scene.frame_idx))
-    return frames >= MIN_FRAMES and count <= LITTLE_WORK
+    frames = num_frames(calibration)
+    if frames < MIN_FRAMES:
+        return f"the result has {frames} frames, and halves need {MIN_FRAMES} or more"
+    if count > LITTLE_WORK:
+        return f"the result has {count:,} observations, more than {LITTLE_WORK:,}"
+    return None
 
 
 def cross_validate_if_cheap(
@@ -129,7 +138,7 @@ def cross_validate_if_cheap(
         None if there are too few frames, or too many observations; without splits, but
         with the reason, if the halves could not be adjusted.
     """
-    if not costs_little(calibration) or not calibration.covariance.determined:
+    if why_not_halved(calibration) or not calibration.covariance.determined:
         return None
     try:
         return cross_validate(rig, calibration)
@@ -157,12 +166,13 @@ def cross_validate(
         seed: of the points whose distances are compared.
 
     Raises:
-        UwsfmError: there are too few frames, or neither split could be adjusted.
+        InputError: there are too few frames.
+        UwsfmError: neither split could be adjusted.
     """
     scene, _ = calibration.scene.select(calibration.inliers)
     frames = np.unique(scene.frame_idx)
     if len(frames) < MIN_FRAMES:
-        raise UwsfmError(
+        raise InputError(
             f"the result has {len(frames)} frames: halves that can be compared need "
             f"{MIN_FRAMES} or more, so a result of so few cannot be cross-validated"
         )

@@ -2,7 +2,13 @@
 
 from collections.abc import Mapping
 
-from uwsfm.trust.halves import CrossValidation
+from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.trust.halves import (
+    MIN_FRAMES,
+    CrossValidation,
+    num_frames,
+    why_not_halved,
+)
 from uwsfm.trust.reason import DOUBTFUL, Reason, reason
 
 FAR_APART = 3.0
@@ -36,6 +42,26 @@ def enlarged_notes(factors: Mapping[str, float]) -> list[str]:
         "by as much"
         for group, factor in factors.items()
     ]
+
+
+def untested_notes(calibration: CalibrationResult, *, has_model: bool) -> list[str]:
+    """That nothing tested the standard deviations, and how to do it, one sentence.
+
+    Args:
+        calibration: of the whole.
+        has_model: whether a model is stored, which `uwsfm check --halves` can read.
+
+    Returns:
+        Nothing if the halves were tested, or there are no standard deviations.
+    """
+    cause = why_not_halved(calibration)
+    if cause is None or not calibration.covariance.determined:
+        return []
+    note = f"the standard deviations were not tested by halves of the frames: {cause}"
+    if num_frames(calibration) < MIN_FRAMES:
+        return [note]
+    first = "" if has_model else "uwsfm reconstruct or refine, and then "
+    return [f"{note}; {first}uwsfm check OUT --halves tests them"]
 
 
 def halves_reasons(found: CrossValidation | None) -> list[Reason]:
