@@ -23,6 +23,7 @@ def simulated_dive(
     num_frames: int = 6,
     num_points: int = 1200,
     seed: int = 0,
+    noise_px: float = 0.4,
 ) -> SimulatedScene:
     """What a rig with tilted ports sees on a varied dive, with the noise of SIFT."""
     return simulate_scene(
@@ -30,7 +31,7 @@ def simulated_dive(
         rich_motion(num_frames),
         Relief(stddev=0.15, correlation_length=0.4, seed=seed),
         ObservationOptions(
-            num_points=num_points, noise_px=0.4, detection_rate=0.6, seed=seed
+            num_points=num_points, noise_px=noise_px, detection_rate=0.6, seed=seed
         ),
     )
 

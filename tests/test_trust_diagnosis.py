@@ -6,11 +6,13 @@ at half their distance. What is diagnosed is what an adjustment makes of the wro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
 
+from uwsfm._progress import silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.geometry import rigid3
 from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
@@ -18,9 +20,15 @@ from uwsfm.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.scene import Scene
 from uwsfm.sfm.correction import CODES
 from uwsfm.sfm.refine import rig_options
-from uwsfm.simulate.rigs import nominal_rig, sample_rig
-from uwsfm.trust.diagnosis import Explanation, diagnose, explain
-from uwsfm.trust.mistakes import shifted
+from uwsfm.simulate.rigs import nominal_rig, sample_rig, tilted_normal
+from uwsfm.trust.diagnosis import (
+    Experiments,
+    Explanation,
+    diagnose,
+    explain,
+    explanations,
+)
+from uwsfm.trust.mistakes import shifted, trials
 from uwsfm.trust.trials import adjusted
 
 NUM_FRAMES = 8
@@ -36,6 +44,7 @@ class Mistake:
     true: Callable[[Rig], Rig] = lambda rig: rig
     also: frozenset[str] = frozenset()
     """What no image can tell from it."""
+    noise_px: float = 0.4
     number: str = ""
     """That the sentence must contain."""
 
@@ -66,6 +75,16 @@ def with_params(
     return lambda rig: replace(rig, cameras=tuple(map(changed, rig.cameras)))
 
 
+def with_camera(which: int, change: Callable[[Rig], Rig]) -> Callable[[Rig], Rig]:
+    """A change of one camera alone."""
+
+    def changed(rig: Rig) -> Rig:
+        pairs = enumerate(zip(rig.cameras, change(rig).cameras, strict=True))
+        return replace(rig, cameras=tuple(pair[c == which] for c, pair in pairs))
+
+    return changed
+
+
 def with_pose(
     change: Callable[[np.ndarray], np.ndarray], held: bool = False
 ) -> Callable[[Rig], Rig]:
@@ -77,6 +96,18 @@ def with_pose(
         )
 
     return changed
+
+
+def with_port_held(part: str, values: tuple[Any, Any]) -> Callable[[Rig], Rig]:
+    """One part of each port held at a value; None leaves a camera as it is."""
+
+    def changed(item: RigCamera, value: Any) -> RigCamera:
+        if value is None:
+            return item
+        port = replace(item.port, **{part: value})
+        return replace(item, port=port, **{f"refine_{part}": False})
+
+    return lambda rig: replace(rig, cameras=tuple(map(changed, rig.cameras, values)))
 
 
 def scaled(slots: list[int], factor: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -150,10 +181,21 @@ FAST = (
         seen=lambda scene: shifted(scene, 1, 1, 4),
         number="1 frame late from frame",
     ),
+    Mistake(
+        code="held_port",
+        rig=with_port_held("distance", (0.05, 0.05)),
+        noise_px=0.15,  # as of a rendered image: 30 mm bend it by 0.06 px
+        number="distance of 'left' and 'right', as held, is wrong (20 mm for 50 mm",
+    ),
     # No order and no sign: the coefficient itself is named, and what it was.
     Mistake(code="distortion", rig=with_params(moved(4, 0.05)), number="for -0.00"),
 )
 SLOW = (
+    Mistake(
+        code="held_port",
+        rig=with_port_held("normal", (tilted_normal(6.0, 40.0), None)),
+        number="normal of 'left', as held, is wrong (it turns by ",
+    ),
     Mistake(code="rotation", rig=with_pose(turned, held=True), number="0.6"),
     Mistake(
         code="port_none",
@@ -208,7 +250,9 @@ def diagnosed(mistake: Mistake) -> tuple[Explanation, ...]:
 def wrong_input(mistake: Mistake) -> tuple[Rig, Scene]:
     """The rig as given, and what an adjustment makes of the dive with it."""
     true = mistake.true(sample_rig())
-    scene = simulated_dive(true, NUM_FRAMES, num_points=250).scene
+    scene = simulated_dive(
+        true, NUM_FRAMES, num_points=250, noise_px=mistake.noise_px
+    ).scene
     rig, scene = mistake.rig(nominal_rig(true)), mistake.seen(scene)
     fit = adjusted(scene, rig)
     if fit is not None:
@@ -230,6 +274,19 @@ def check(mistake: Mistake) -> None:
 @pytest.mark.parametrize("mistake", FAST, ids=lambda mistake: mistake.code)
 def test_the_mistake_is_named(mistake):
     check(mistake)
+
+
+def test_one_camera_is_not_blamed_for_two():
+    """The lens of the other camera is right: set free as well, it fits no better."""
+    right_alone = Mistake(code="", rig=with_camera(1, with_params(moved(2, 40.0))))
+    rig, scene = wrong_input(right_alone)
+    experiments = Experiments({}, silent)
+    own = [t for t in trials(rig, NUM_FRAMES) if t.code == "principal_point"]
+    found = explanations(experiments.given(rig, scene), experiments.all(own, scene))
+    assert [one.code for one in found] == ["principal_point"]
+    assert "principal point of 'right' is wrong" in found[0].text
+    assert "436.3" in found[0].text
+    assert "'left'" not in found[0].text
 
 
 @pytest.mark.slow

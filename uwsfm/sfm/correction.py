@@ -12,6 +12,7 @@ CODES = (
     "port_missing",
     "undistorted",
     "rotation",
+    "held_port",
     "rotation_transposed",
     "pose_inverted",
     "quaternion_order",
@@ -47,6 +48,8 @@ class Correction:
     """The mistake, a clause that names the cameras."""
     remedy: str
     """What to change in the rig file or the images: an imperative clause."""
+    cameras: tuple[int, ...] = ()
+    """The cameras that have the mistake; empty: the rig as a whole."""
     exchanged: bool = False
     """The images of the first two cameras change places."""
     flipped: int | None = None

@@ -91,6 +91,7 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
                 yield Correction(
                     code=code,
                     rig=other,
+                    cameras=which,
                     what=what.format(names=names),
                     remedy=remedy.format(names=names),
                 )

@@ -63,6 +63,7 @@ def port_corrections(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="port_none",
             rig=_with_ports(rig, which, lambda _: NoPort()),
+            cameras=which,
             what=f"the lens of {names} was calibrated in the water, though the rig "
             "file has a port",
             remedy=f"write port: {{type: none}} for {names}, or give the lens as "
@@ -83,6 +84,7 @@ def missing_ports(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="port_missing",
             rig=_with_ports(rig, which, lambda _: FlatPort(), free=True),
+            cameras=which,
             what=f"the port of {names} is missing in the rig file, where type none is "
             "for a lens that was calibrated in the water, not in air",
             remedy=f"describe the port of {names} there",
@@ -96,6 +98,7 @@ def _other_kinds(rig: Rig) -> Iterator[Correction]:
             yield Correction(
                 code="dome_as_flat",
                 rig=_with_ports(rig, which, _as_dome(radius), free=True),
+                cameras=which,
                 what=f"the port of {names} is a dome, and not flat",
                 remedy=f"describe the port of {names} as type: dome",
             )
@@ -104,6 +107,7 @@ def _other_kinds(rig: Rig) -> Iterator[Correction]:
         yield Correction(
             code="flat_as_dome",
             rig=_with_ports(rig, which, _as_flat, free=True),
+            cameras=which,
             what=f"the port of {names} is flat, and no dome",
             remedy=f"describe the port of {names} as type: flat",
         )

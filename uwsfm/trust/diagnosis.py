@@ -150,7 +150,7 @@ def diagnose(
     """
     part, frames = thinned(scene)
     names = [frame_names[f] if frame_names else f"{f + 1}" for f in frames.tolist()]
-    experiments = _Experiments(options, progress)
+    experiments = Experiments(options, progress)
     base = experiments.given(rig, part)
     todo = [
         *trials(rig, part.num_frames),
@@ -185,7 +185,7 @@ def without_refuted(tried: Sequence[Tried]) -> list[Tried]:
 
 
 def _zooms(
-    experiments: _Experiments,
+    experiments: Experiments,
     rig: Rig,
     part: Scene,
     names: Sequence[str],
@@ -215,7 +215,7 @@ def _zooms(
     return [best] if best.total <= min(common) - CLEAR else []
 
 
-class _Experiments:
+class Experiments:
     """Runs trials, and counts them."""
 
     def __init__(self, options: dict[str, Any], progress: Progress) -> None:
@@ -295,11 +295,27 @@ def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]
         if one.total - better[0].total > TIE:
             break
         if all(one.trial.code != other.trial.code for other in chosen):
-            chosen.append(one)
+            chosen.append(_of_fewest_cameras(one, better))
     # Of those that cannot be told apart, what the images say goes before what is usual.
     limit = min((one.fit.rms_px for one in chosen), default=0.0) * (1.0 + CLEAR * UNIT)
     chosen.sort(key=lambda one: (one.fit.rms_px > limit, one.total))
     return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
+
+
+def _of_fewest_cameras(best: Tried, better: Iterable[Tried]) -> Tried:
+    """The trial of the same kind that accuses the fewest cameras and explains as well:
+    numbers that are right and set free change nothing, and fit no worse."""
+    as_good = (
+        one
+        for one in better
+        if one.trial.code == best.trial.code and one.total - best.total <= AS_GOOD
+    )
+
+    def rank(one: Tried) -> tuple[int, float]:
+        concerned = one.trial.cameras or one.trial.rig.cameras
+        return len(concerned), one.total
+
+    return min(as_good, key=rank)
 
 
 def _explained(base: Tried, one: Tried) -> Explanation:

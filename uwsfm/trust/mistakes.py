@@ -15,10 +15,10 @@ import numpy as np
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
-from uwsfm.rig import Rig
+from uwsfm.models.port import DomePort, FlatPort, Port
+from uwsfm.rig import Rig, RigCamera
 from uwsfm.scene import Scene
-from uwsfm.sfm.correction import Correction
+from uwsfm.sfm.correction import Correction, quoted, subsets
 from uwsfm.sfm.lens_mistakes import distortion, num_pinhole
 from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
@@ -43,6 +43,8 @@ SAME_UNIT = 2.0
 """Ports tell a factor this well: the ruler is no better."""
 MAX_DISTANCE_M = 0.15
 """Of a usual port."""
+MAX_THICKNESS_M = 0.1
+"""Glass of a usual port."""
 RARE = 6.0
 """Handicap of a port that no usual housing has."""
 PORT_FACTORS = (10.0, 0.1, 25.4, 1.0 / 25.4)
@@ -62,6 +64,8 @@ class Trial:
     """The observations put right, and poses to start from."""
     options: dict[str, Any] = field(default_factory=dict)
     """Further fields of `CalibrateOptions`."""
+    cameras: tuple[int, ...] = ()
+    """The cameras that have the mistake; empty: the rig as a whole."""
     first: int = 0
     """The frame from which on something changed."""
     handicap: float = 0.0
@@ -86,6 +90,7 @@ def trials(rig: Rig, num_frames: int) -> Iterator[Trial]:
     yield from _free_lenses(rig)
     yield from _free_distortions(rig)
     yield from _free_rotation(rig)
+    yield from _free_ports(rig)
     yield from shifts(rig, num_frames)
 
 
@@ -95,6 +100,7 @@ def _of_correction(correction: Correction) -> Trial:
         what=correction.what,
         remedy=correction.remedy,
         rig=correction.rig,
+        cameras=correction.cameras,
         seen=lambda scene: _corrected(scene, correction),
         handicap=RARER.get(correction.code, 0.0),
     )
@@ -130,45 +136,49 @@ DISTORTION_STDDEV = 0.5
 
 
 def _free_lenses(rig: Rig) -> Iterator[Trial]:
-    names = " and ".join(repr(camera.name) for camera in rig.cameras)
-    yield Trial(
-        code="focal",
-        what=f"the focal length of {names} is wrong",
-        remedy="check fx and fy: zoom, focus, video mode and image size must be those "
-        "of the calibration",
-        rig=rig,
-        options=FOCAL,
-        handicap=FREE,
-        estimate=lambda fit: _lens_words(rig, fit, slice(0, 2), "fx, fy"),
-    )
-    yield Trial(
-        code="principal_point",
-        what=f"the principal point of {names} is wrong",
-        remedy="check cx and cy: crop, image size and pixel origin must be those of "
-        "the calibration",
-        rig=rig,
-        options=CENTER,
-        handicap=FREE,
-        estimate=lambda fit: _lens_words(rig, fit, slice(2, 4), "cx, cy"),
-    )
+    """Focal length and principal point of all cameras, then of each alone."""
+    for which in subsets(rig, lambda _: True):
+        names = quoted(rig, which)
+        free = tuple(c in which for c in range(len(rig.cameras)))
+        yield Trial(
+            code="focal",
+            what=f"the focal length of {names} is wrong",
+            remedy="check fx and fy: zoom, focus, video mode and image size must be "
+            "those of the calibration",
+            rig=rig,
+            options={**FOCAL, "refine_focal": free},
+            cameras=which,
+            handicap=FREE,
+            estimate=partial(_lens_words, rig, which, slice(0, 2), "fx, fy"),
+        )
+        yield Trial(
+            code="principal_point",
+            what=f"the principal point of {names} is wrong",
+            remedy="check cx and cy: crop, image size and pixel origin must be those "
+            "of the calibration",
+            rig=rig,
+            options={**CENTER, "refine_principal_point": free},
+            cameras=which,
+            handicap=FREE,
+            estimate=partial(_lens_words, rig, which, slice(2, 4), "cx, cy"),
+        )
 
 
 def _free_distortions(rig: Rig) -> Iterator[Trial]:
     """The distortion of all cameras, then of each alone: the numbers are wrong, by no
     order or sign that has a name."""
-    every = tuple(range(len(rig.cameras)))
-    for which in dict.fromkeys((every, *((c,) for c in every))):
-        names = " and ".join(repr(rig.cameras[c].name) for c in which)
+    for which in subsets(rig, lambda _: True):
         yield Trial(
             code="distortion",
-            what=f"the distortion of {names}, as given, does not fit",
+            what=f"the distortion of {quoted(rig, which)}, as given, does not fit",
             remedy="check these coefficients, their order and their sign, or calibrate "
             "the lens anew",
             rig=rig,
             options={
-                "refine_distortion": tuple(c in which for c in every),
+                "refine_distortion": tuple(c in which for c in range(len(rig.cameras))),
                 "distortion_stddev": DISTORTION_STDDEV,
             },
+            cameras=which,
             handicap=FREE * len(which),
             estimate=partial(_distortion_words, rig, which),
         )
@@ -189,12 +199,73 @@ def _free_rotation(rig: Rig) -> Iterator[Trial]:
     )
 
 
-def _lens_words(rig: Rig, fit: Fit, part: slice, names: str) -> str:
-    """What two numbers of each lens came out as, and what they were."""
+PORT_PARTS: tuple[tuple[type[Port], tuple[str, ...]], ...] = (
+    (FlatPort, ("distance",)),
+    (FlatPort, ("normal",)),
+    (FlatPort, ("distance", "normal")),
+    (DomePort, ("center",)),
+)
+"""What a rig file may hold of a port, and what may be wrong at once."""
+
+
+def _free_ports(rig: Rig) -> Iterator[Trial]:
+    """What the rig file holds of the ports, of all cameras and of each alone."""
+    for kind, parts in PORT_PARTS:
+        for which in subsets(rig, partial(_holds, kind=kind, parts=parts)):
+            flags: dict[str, Any] = {f"refine_{part}": True for part in parts}
+            names, held = quoted(rig, which), " and ".join(parts)
+            yield Trial(
+                code="held_port",
+                what=f"the port {held} of {names}, as held, "
+                f"{'are' if len(parts) > 1 else 'is'} wrong",
+                remedy=f"add {held} to refine of the port of {names}, or measure the "
+                "port again",
+                rig=replace(
+                    rig,
+                    cameras=tuple(
+                        replace(item, **flags) if c in which else item
+                        for c, item in enumerate(rig.cameras)
+                    ),
+                ),
+                cameras=which,
+                handicap=FREE * len(parts),
+                estimate=partial(_port_words, rig, which, parts),
+            )
+
+
+def _holds(item: RigCamera, kind: type[Port], parts: tuple[str, ...]) -> bool:
+    held = not any(getattr(item, f"refine_{part}") for part in parts)
+    return isinstance(item.port, kind) and held
+
+
+def _port_words(
+    rig: Rig, which: tuple[int, ...], parts: tuple[str, ...], fit: Fit
+) -> str:
+    """The freed numbers of some ports, and what the rig file has."""
+    pairs = [(rig.cameras[c].port, fit.scene.ports[c]) for c in which]
+    words = [_port_change(*pair, part) for part in parts for pair in pairs]
+    return f" ({'; '.join(words)})"
+
+
+def _port_change(old: Port, new: Port, part: str) -> str:
+    """A changed distance or dome centre in millimetres, or the turn of a normal."""
+    before, after = (np.atleast_1d(getattr(port, part)) for port in (old, new))
+    if part == "normal":
+        turn = np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)
+        return f"it turns by {np.degrees(turn):.1f} degrees"
+    was, to = (", ".join(f"{1e3 * v:.0f}" for v in value) for value in (before, after))
+    return f"{to} mm for {was} mm"
+
+
+def _lens_words(
+    rig: Rig, which: tuple[int, ...], part: slice, names: str, fit: Fit
+) -> str:
+    """What two numbers of some lenses came out as, and what they were."""
+    given = rig.refractive_cameras()
     words = [
-        f"{', '.join(f'{value:.1f}' for value in new.lens[part])} for "
-        f"{', '.join(f'{value:.1f}' for value in old.lens[part])}"
-        for new, old in zip(fit.scene.cameras, rig.refractive_cameras(), strict=True)
+        f"{', '.join(f'{value:.1f}' for value in fit.scene.cameras[c].lens[part])} for "
+        f"{', '.join(f'{value:.1f}' for value in given[c].lens[part])}"
+        for c in which
     ]
     return f" ({names}: {'; '.join(words)})"
 
@@ -269,22 +340,26 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
             handicap=0.0 if given < MAX_DISTANCE_M else RARE,
         )
     for times in PORT_FACTORS:
-        low, high = (times * port.distance for port in (flat[0], flat[-1]))
-        plausible = min(low, high) > 1e-3 and max(low, high) < MAX_DISTANCE_M
         yield Trial(
             code="length_unit",
             what=f"the port distances are {times:.3g} times those of the rig file",
             remedy="check the unit of distance_m, which is metres",
             rig=_with_port_length(rig, "distance", times),
-            handicap=1.0 if plausible else RARE,
+            handicap=_rarity([times * p.distance for p in flat], MAX_DISTANCE_M),
         )
         yield Trial(
             code="length_unit",
             what=f"the glass is {times:.3g} times as thick as in the rig file",
             remedy="check the unit of thickness_m, which is metres",
             rig=_with_port_length(rig, "thickness", times),
-            handicap=FREE,
+            handicap=_rarity([times * p.thickness for p in flat], MAX_THICKNESS_M),
         )
+
+
+def _rarity(lengths_m: list[float], most_m: float) -> float:
+    """Handicap of such ports."""
+    usual = min(lengths_m) > 1e-3 and max(lengths_m) < most_m
+    return FREE if usual else RARE
 
 
 def _unit_of(factor: float) -> tuple[str, str]:
