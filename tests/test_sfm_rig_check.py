@@ -14,7 +14,13 @@ from uwsfm.geometry import rigid3
 from uwsfm.models.port import DomePort, NoPort
 from uwsfm.rig import Rig, camera_from_colmap
 from uwsfm.scene import Scene
-from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
+from uwsfm.sfm.rig_check import (
+    MAX_TURN_DEG,
+    _apart,
+    check_rig,
+    check_rotation,
+    turn_causes,
+)
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
@@ -186,6 +192,43 @@ def test_a_lens_of_half_the_resolution_is_named(rig, pair):
     assert "of images 0.5 times as large" in text
 
 
+@pytest.mark.parametrize("larger", [1.25, 0.8, 1.4])
+def test_a_lens_of_any_usual_resolution_is_named(rig, pair, larger):
+    """As of 1000 x 750 for 800 x 600; such steps lie closer to each other than
+    principal points to the middle."""
+    text = refusal(with_params(rig, (1,), slice(0, 4), larger), poses_of(rig), pair)
+    assert "the lens of 'right' was calibrated at another resolution" in text
+    assert f"of images {larger:.3g} times as large" in text
+    assert "taken together" not in text
+
+
+def test_a_lens_of_another_shape_of_image_is_named(rig, pair):
+    """Calibrated in 16:9 at 1600 x 900, for 4:3 of the same height at 800 x 600: one
+    and a half times, with 133 pixels of 1067 cropped at the left."""
+    lens = rig.cameras[1].camera
+    fx, fy, cx, cy, *distortion = lens.params.tolist()
+    wide = [1.5 * fx, 1.5 * fy, 1.5 * (cx + 400.0 / 3.0), 1.5 * cy, *distortion]
+    given = camera_from_colmap(lens.model_name, lens.width, lens.height, wide)
+    cameras = rig.cameras[0], replace(rig.cameras[1], camera=given)
+    text = refusal(replace(rig, cameras=cameras), poses_of(rig), pair)
+    assert "'right' was calibrated at another resolution and shape" in text
+    assert "1.5 times as large" in text
+
+
+def test_a_lens_calibrated_in_the_water_is_named_before_its_focal_length(rig, pair):
+    wet = with_params(rig, (1,), slice(0, 2), 1.333)
+    text = refusal(wet, poses_of(rig), pair)
+    assert "probably the lens of 'right' was calibrated in the water" in text
+    assert "else its focal length is 33% too long" in text
+
+
+def test_a_wrong_lens_is_no_pair_of_images_taken_apart(rig, pair):
+    """Enlarged by 0.87, which nothing has as a video mode: no placement fits more than
+    80% of the matches, and each frame's own nearly all, as if taken apart."""
+    given = with_params(rig, (1,), slice(0, 4), 0.87)
+    assert set(_apart(given, pair)) == {"focal"}
+
+
 def test_the_focal_length_of_one_camera_is_named(rig, pair):
     """Which of the two is wrong no match shows: one too long is the other too short."""
     text = refusal(with_params(rig, (1,), slice(0, 2), 1.2), poses_of(rig), pair)
@@ -324,7 +367,7 @@ def test_turns_make_the_rays_meet(rig, pair):
     assert found.misfit_after * focal_px < 0.5
     assert found.turn_deg[0] == 0.0
     assert 0.2 < found.turn_deg[1] < 0.8
-    assert found.warnings(rig) == []
+    assert found.warnings(rig, {}) == []
 
 
 def test_turns_keep_the_camera_centres(rig, pair):
@@ -337,8 +380,22 @@ def test_turns_keep_the_camera_centres(rig, pair):
 def test_a_notable_turn_is_reported(rig, pair):
     poses = poses_of(rig)
     poses[1] = rigid3.perturb(poses[1], np.radians([3.0, 0, 0, 0, 0, 0]))
-    (warning,) = turned(rig, poses, pair).warnings(rig)
-    assert "'right'" in warning
+    rotation = turned(rig, poses, pair)
+    causes = turn_causes(rig, poses, rotation, [pair])
+    (warning,) = rotation.warnings(rig, causes)
+    assert "'right'" in warning and "transposed" not in warning
+
+
+def test_the_note_of_a_turn_names_the_mistake_that_it_healed(rig, pair):
+    """A transposed rotation of 2 degrees: the turn back is of nearly 4, a port tilted
+    by 15, which nobody mounts."""
+    poses = poses_of(rig)
+    poses[1, :3] *= -1.0
+    rotation = turned(rig, poses, pair)
+    check_rotation(rig, poses, rotation, [pair])
+    (note,) = rotation.warnings(rig, turn_causes(rig, poses, rotation, [pair]))
+    assert "probably the rotation of 'right' is transposed: transpose" in note
+    assert "port" not in note
 
 
 def test_one_picture_in_both_folders_has_no_depth(rig, pair):

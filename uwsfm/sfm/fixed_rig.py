@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.pinhole_fit import VirtualPinhole, fit_virtual_pinhole
-from uwsfm.sfm.rig_check import check_rig, check_rotation
+from uwsfm.sfm.rig_check import check_rig, check_rotation, turn_causes
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import (
     PairMatches,
@@ -36,6 +36,8 @@ class FixedRig:
     depths: Array
     pinholes: tuple[VirtualPinhole, ...]
     num_matches: int
+    turn_causes: Mapping[int, str]
+    """As of `rig_check.turn_causes`."""
 
 
 def fix_rig(
@@ -69,8 +71,10 @@ def fix_rig(
     if len(cameras) > 1:
         check_rig(rig, poses, pairs, shifted, successive)
     rotation = correct_rotations(cameras, poses, pairs)
+    causes: Mapping[int, str] = {}
     if len(cameras) > 1:
         check_rotation(rig, poses, rotation, pairs, shifted)
+        causes = turn_causes(rig, poses, rotation, pairs, shifted)
         depths = scene_depths(cameras, rotation.cam_from_rig, pairs)
     else:
         depths = scene_distance_m * np.array([NEAR_TO_FAR])
@@ -83,6 +87,7 @@ def fix_rig(
         depths=depths,
         pinholes=pinholes,
         num_matches=sum(len(pair) for pair in pairs),
+        turn_causes=causes,
     )
 
 
@@ -110,7 +115,7 @@ def mapping_summary(
         others: Numbers of frames of the smaller models.
     """
     missing = [name for name in frames.names if name not in registered]
-    warnings = frames.warnings() + fixed.rotation.warnings(rig)
+    warnings = frames.warnings() + fixed.rotation.warnings(rig, fixed.turn_causes)
     if missing:
         warnings.append(
             f"{len(missing)} of {len(frames.names)} frames could not be registered: "

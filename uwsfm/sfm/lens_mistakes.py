@@ -7,7 +7,7 @@ here is how the numbers of calibrations differ from those that a rig file takes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -16,15 +16,23 @@ import numpy as np
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.port import NoPort, Port
 from uwsfm.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.sfm.correction import Correction, quoted, subsets
 
 FOCAL_FACTORS = (0.75, 0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.3)
 """What a wrong zoom or video mode makes of a focal length, in steps."""
+SAME_INDEX = 0.02
+"""A focal length that is too long by the water index within this was calibrated in the
+water: no zoom is that by chance as often."""
 SAME_SCALE = 0.08
 """How far off the middle a principal point may be, relative."""
-SCALES = (2.0, 0.5, 1.5, 2.0 / 3.0, 4.0 / 3.0, 0.75, 4.0, 0.25)
-"""Sizes of an image against that of its calibration: 4K, 1080p, 720p, binning."""
+SCALES = tuple(
+    scale
+    for ratio in (1.25, 4.0 / 3.0, 1.4, 1.5, 2.0, 3.0, 4.0)
+    for scale in (ratio, 1.0 / ratio)
+)
+"""Sizes of an image against that of its calibration: 4K, 2.7K, 1080p, 720p, binning."""
 
 
 def with_lens(camera: RigCamera, model: str, params: Array) -> RigCamera | None:
@@ -40,7 +48,7 @@ def with_lens(camera: RigCamera, model: str, params: Array) -> RigCamera | None:
 _Change = Callable[[RigCamera], RigCamera | None]
 
 
-def _changed(rig: Rig, which: tuple[int, ...], change: _Change) -> Rig | None:
+def changed_lenses(rig: Rig, which: tuple[int, ...], change: _Change) -> Rig | None:
     cameras = list(rig.cameras)
     for c in which:
         other = change(cameras[c])
@@ -84,7 +92,7 @@ def lens_corrections(rig: Rig) -> Iterator[Correction]:
 
         for which in subsets(rig, concerns):
             for what, remedy, change in variants(rig.cameras[which[0]]):
-                other = _changed(rig, which, change)
+                other = changed_lenses(rig, which, change)
                 if other is None:
                     continue
                 names = quoted(rig, which)
@@ -216,11 +224,17 @@ def _fisheyes(camera: RigCamera) -> Iterator[_Variant]:
     )
 
 
-def focal_corrections(rig: Rig) -> Iterator[Correction]:
-    """The focal length of one camera by a factor, for who cannot set it free."""
-    for c, item in enumerate(rig.cameras):
+def focal_corrections(rig: Rig, which: Sequence[int]) -> Iterator[Correction]:
+    """The focal length of one of some cameras by a factor, for who cannot set it free.
+
+    That of the water index is left to `rig_mistakes.lenses_in_water`.
+    """
+    for c in which:
+        item = rig.cameras[c]
         for factor in FOCAL_FACTORS:
-            other = _changed(rig, (c,), partial(_with_focal, factor=factor))
+            if _is_of_water(item.port, factor):
+                continue
+            other = changed_lenses(rig, (c,), partial(with_focal, factor=factor))
             if other is None:
                 continue
             way, other_way = ("long", "short")[:: 1 if factor < 1.0 else -1]
@@ -235,7 +249,15 @@ def focal_corrections(rig: Rig) -> Iterator[Correction]:
             )
 
 
-def _with_focal(camera: RigCamera, factor: float) -> RigCamera | None:
+def _is_of_water(port: Port, factor: float) -> bool:
+    """Whether a focal length by ``factor`` is that of the lens in air, from one that
+    was calibrated in the water."""
+    if isinstance(port, NoPort):
+        return False
+    return abs(factor * port.n_water - 1.0) <= SAME_INDEX
+
+
+def with_focal(camera: RigCamera, factor: float) -> RigCamera | None:
     params = np.array(camera.camera.params)
     params[list(camera.camera.focal_length_idxs())] *= factor
     return with_lens(camera, camera.camera.model_name, params)
@@ -249,13 +271,21 @@ def scaled_lens(camera: RigCamera, scale: float) -> RigCamera | None:
 
 
 def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
-    """The size for which the principal point is in the middle, if not this one."""
+    """The sizes for which the principal point is about in the middle, if not this one.
+
+    Usual ones lie closer to each other than a principal point to the middle: all that
+    it allows are given. Where only one of its coordinates allows a size, the image was
+    cropped to another shape, and the other coordinate is in the middle.
+    """
     lens = camera.camera
-    scale = 0.5 * lens.width / lens.principal_point_x
-    usual = min((1.0, *SCALES), key=lambda known: abs(math.log(known / scale)))
-    if abs(math.log(usual / scale)) < SAME_SCALE:
-        scale = usual
-    if scale != 1.0:
+    both = (
+        0.5 * lens.width / lens.principal_point_x,
+        0.5 * lens.height / lens.principal_point_y,
+    )
+    if abs(math.log(both[0] / both[1])) > 2.0 * SAME_SCALE:
+        yield from _crops(sorted({s for near in both for s in _usual_scales(near)}))
+        return
+    for scale in _usual_scales(both[0]):
         yield (
             f"the lens of {{names}} was calibrated at another resolution, of images "
             f"{1.0 / scale:.3g} times as large",
@@ -265,16 +295,43 @@ def _resolutions(camera: RigCamera) -> Iterator[_Variant]:
         )
 
 
-def _centers(camera: RigCamera) -> Iterator[_Variant]:
-    def centred(item: RigCamera) -> RigCamera | None:
-        params = np.array(item.camera.params)
-        middle = 0.5 * item.camera.width, 0.5 * item.camera.height
-        params[list(item.camera.principal_point_idxs())] = middle
-        return with_lens(item, item.camera.model_name, params)
+def _usual_scales(near: float) -> list[float]:
+    """The usual scales about ``near``, itself if there are none; empty if it is 1."""
+    usual = min((1.0, *SCALES), key=lambda known: abs(math.log(known / near)))
+    if usual == 1.0 and abs(math.log(near)) < SAME_SCALE:
+        return []
+    close = [known for known in SCALES if abs(math.log(known / near)) < SAME_SCALE]
+    return close or [near]
 
+
+def _crops(scales: Sequence[float]) -> Iterator[_Variant]:
+    for scale in scales:
+
+        def cropped(item: RigCamera, scale: float = scale) -> RigCamera | None:
+            other = scaled_lens(item, scale)
+            return None if other is None else _centred(other)
+
+        yield (
+            "the lens of {names} was calibrated at another resolution and shape of "
+            f"image, {1.0 / scale:.3g} times as large and cropped otherwise",
+            "give the lens of {names} for the image size that is in the file: multiply "
+            f"fx, fy, cx and cy by {scale:.3g}, then subtract from cx and cy what was "
+            "cropped at the left and the top",
+            cropped,
+        )
+
+
+def _centred(item: RigCamera) -> RigCamera | None:
+    params = np.array(item.camera.params)
+    middle = 0.5 * item.camera.width, 0.5 * item.camera.height
+    params[list(item.camera.principal_point_idxs())] = middle
+    return with_lens(item, item.camera.model_name, params)
+
+
+def _centers(_: RigCamera) -> Iterator[_Variant]:
     yield (
         "the principal point of {names} is in the middle of the image",
         "give cx and cy of {names} in pixels of these images: crop, image size and "
         "pixel origin must be those of the calibration",
-        centred,
+        _centred,
     )

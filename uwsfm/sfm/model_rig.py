@@ -21,7 +21,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.baseline import MAX_FRAMES, robust_average
 from uwsfm.sfm.colmap_model import ImageModel
-from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation
+from uwsfm.sfm.rig_check import MAX_TURN_DEG, check_rig, check_rotation, turn_causes
 from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, correct_rotations
 from uwsfm.sfm.same_frame import PairMatches
 
@@ -278,7 +278,8 @@ def _checked_start(
         check_rig(rig, poses, matches)
         rotation = correct_rotations(rig.refractive_cameras(), poses, matches)
         check_rotation(rig, poses, rotation, matches)
-        notes = rotation.warnings(rig)
+        causes = turn_causes(rig, poses, rotation, matches)
+        notes = rotation.warnings(rig, causes)
         if rig.refine_cam_from_rig:
             poses = rotation.cam_from_rig
     for pairs in found:

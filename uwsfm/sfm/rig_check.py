@@ -14,6 +14,7 @@ from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.sfm.epipolar import relative_pose
+from uwsfm.sfm.lens_mistakes import focal_corrections
 from uwsfm.sfm.mirrored_camera import mirrored_camera
 from uwsfm.sfm.moved_ports import ports_explain
 from uwsfm.sfm.relative_pose import estimate_relative_pose
@@ -22,12 +23,13 @@ from uwsfm.sfm.rig_ideas import (
     MAX_REST,
     MAX_TURN_DEG,
     Shifted,
+    clean_remedies,
     fit_of,
     likely,
     remedies,
     shift_ideas,
 )
-from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, RigRotation
+from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, NOTABLE_TURN_DEG, RigRotation
 from uwsfm.sfm.same_frame import PairMatches
 
 MIN_IN_FRONT = 0.5
@@ -38,6 +40,10 @@ SAME_PLACEMENT = 0.9
 """Share of the matches of same frames, each frame's of which agree with each other,
 that one placement of two cameras explains: 0.99 where the rig file's is wrong, 0.6 to
 0.8 where images of equal names were not taken together."""
+CLEARLY_ONE_PLACEMENT = 0.15
+"""By so much the share of single frames, median, must be larger than that of all."""
+LENS_MATCHES = 400
+"""Are enough to see whether another focal length makes one placement fit."""
 POSE_HINT = (
     "check its rotation (order x, y, z, w; x_in_cam = R x_in_rig + translation_m) and "
     "the axes of translation_m, and that images of equal names were taken together"
@@ -156,22 +162,77 @@ def check_rotation(
     raise _misfit_error(a, b, rotation.misfit_after)
 
 
+def turn_causes(
+    rig: Rig,
+    cam_from_rig: Array,
+    rotation: RigRotation,
+    pairs: Sequence[PairMatches],
+    shifted: Shifted | None = None,
+) -> dict[int, str]:
+    """Mistakes that a turn may have healed, though nothing was refused.
+
+    Args:
+        rig: Cameras and initial ports.
+        cam_from_rig: Poses (C, 7) before any turn.
+        rotation: The turns that fit them best.
+        pairs: Matches of the same frame.
+        shifted: As of `check_rig`.
+
+    Returns:
+        Clauses by the numbers of the cameras whose turn is notable: only mistakes
+        without which hardly any turn is left. None where a dome's centre is refined.
+    """
+    if any(item.refine_center for item in rig.cameras):
+        return {}
+    causes = {}
+    for c in np.flatnonzero(rotation.turn_deg > NOTABLE_TURN_DEG).tolist():
+        seen = [pair for pair in pairs if c in (pair.camera_a, pair.camera_b)]
+        found = clean_remedies(rig, cam_from_rig, max(seen, key=len), shifted)
+        if found:
+            causes[c] = _words(found)
+    return causes
+
+
 def _apart(rig: Rig, pair: PairMatches) -> dict[str, str]:
     """Images that were not taken together: no placement of two cameras fits them all,
-    though in each frame one does. As of `remedies`."""
-    cameras = rig.refractive_cameras()
-    a, b = pair.camera_a, pair.camera_b
-    found = estimate_relative_pose(cameras[a], cameras[b], pair.xy_a, pair.xy_b)
-    share = 0.0 if found is None else found.num_inliers / len(pair)
-    if share >= SAME_PLACEMENT or len(np.unique(pair.frame_idx)) < 2:
+    though in each frame one does. As of `remedies`.
+
+    A wrong lens is like that, too, as a frame's own placement takes up a part of it;
+    but then one placement fits all frames with another focal length.
+    """
+    share = _placed(rig, pair)
+    if share >= SAME_PLACEMENT:
         return {}
+    frames = [
+        pair.selected(pair.frame_idx == frame) for frame in np.unique(pair.frame_idx)
+    ]
+    alone = [_placed(rig, one) for one in frames if len(one) >= MIN_RIG_MATCHES]
+    if len(alone) < 2 or np.median(alone) < share + CLEARLY_ONE_PLACEMENT:
+        return {}
+    few = pair.thinned(LENS_MATCHES)
+    first, second = (rig.cameras[c].name for c in (pair.camera_a, pair.camera_b))
+    for lens in focal_corrections(rig, [pair.camera_b]):
+        if _placed(lens.rig, few) >= SAME_PLACEMENT:
+            phrase = (
+                f"the lens of {second!r} or {first!r}, for with another focal length "
+                "one placement fits all frames: check fx, fy, cx, cy and the image "
+                "size they were calibrated for"
+            )
+            return {"focal": phrase}
     phrase = (
-        f"images of {rig.cameras[a].name!r} and {rig.cameras[b].name!r} with equal "
-        f"names were not taken together, for no single placement fits more than "
-        f"{share:.0%} of the matches: pair the images anew, one camera may be late by "
-        "many frames"
+        f"images of {first!r} and {second!r} with equal names were not taken together, "
+        f"for no single placement fits more than {share:.0%} of the matches: pair the "
+        "images anew, one camera may be late by many frames"
     )
     return {"frames_shifted": phrase}
+
+
+def _placed(rig: Rig, pair: PairMatches) -> float:
+    """Share of the matches of two cameras that their best placement fits."""
+    cameras = rig.refractive_cameras()
+    a, b = cameras[pair.camera_a], cameras[pair.camera_b]
+    found = estimate_relative_pose(a, b, pair.xy_a, pair.xy_b)
+    return 0.0 if found is None else found.num_inliers / len(pair)
 
 
 def _may_be_ports(

@@ -25,6 +25,7 @@ from uwsfm.sfm.rig_mistakes import (
     SHIFTS,
     corrected_pixels,
     corrections,
+    lenses_in_water,
     shift_words,
 )
 from uwsfm.sfm.rig_rotation import MIN_RIG_MATCHES, correct_rotations
@@ -124,18 +125,12 @@ def remedies(
     Returns:
         Clauses by the names of the mistakes, likeliest first; empty if none explains.
     """
-    posed = replace(
-        rig,
-        cam_from_rig=cam_from_rig,
-        baseline_m=float(np.linalg.norm(cam_from_rig[1, 4:])),
-    )
-    undone = [*corrections(posed), *focal_corrections(posed)]
-    ideas = [_turned(item, _corrected(item, pair)) for item in undone]
-    ideas += shift_ideas(rig, cam_from_rig, pair, shifted)
+    posed = _posed(rig, cam_from_rig)
     given = Correction(code="", rig=posed, what="", remedy="")
     as_given = _turned(given, pair)
+    ideas = _without_moving(posed, pair, shifted)
     found = _better([as_given], ideas)
-    if any(idea.misfit <= CLEAN_MISFIT and idea.strain <= 1.0 for idea in found):
+    if any(_clean(idea) for idea in found):
         return likely(found)
     ideas += zoom_ideas(posed, pair)
     ideas.sort(key=lambda idea: idea.badness(LEAST_MISFIT))
@@ -153,6 +148,44 @@ def remedies(
     if phrases and turned.misfit <= SAME_MISFIT * max(least, LEAST_MISFIT):
         phrases["rotation"] = _turn_words(turned)
     return phrases
+
+
+def clean_remedies(
+    rig: Rig,
+    cam_from_rig: Array,
+    pair: PairMatches,
+    shifted: Shifted | None = None,
+) -> dict[str, str]:
+    """As `remedies`, but only those that leave hardly any turn and no port to move:
+    what a rig that is not refused may owe its turn to."""
+    posed = _posed(rig, cam_from_rig)
+    given = Correction(code="", rig=posed, what="", remedy="")
+    ideas = _without_moving(posed, pair, shifted)
+    better = _better([_turned(given, pair)], ideas)
+    return likely([idea for idea in better if _clean(idea)])
+
+
+def _posed(rig: Rig, cam_from_rig: Array) -> Rig:
+    length = float(np.linalg.norm(cam_from_rig[1, 4:]))
+    return replace(rig, cam_from_rig=cam_from_rig, baseline_m=length)
+
+
+def _clean(idea: _Idea) -> bool:
+    return idea.misfit <= CLEAN_MISFIT and idea.strain <= 1.0
+
+
+def _without_moving(
+    posed: Rig, pair: PairMatches, shifted: Shifted | None
+) -> list[_Idea]:
+    """Every mistake undone, with the ports as given."""
+    assert posed.cam_from_rig is not None
+    undone = [
+        *lenses_in_water(posed),
+        *corrections(posed),
+        *focal_corrections(posed, range(len(posed.cameras))),
+    ]
+    ideas = [_turned(item, _corrected(item, pair)) for item in undone]
+    return ideas + shift_ideas(posed, posed.cam_from_rig, pair, shifted)
 
 
 def _turn_words(idea: _Idea) -> str:
@@ -194,11 +227,7 @@ def shift_ideas(
     if shifted is None:
         return []
     ideas = []
-    posed = replace(
-        rig,
-        cam_from_rig=cam_from_rig,
-        baseline_m=float(np.linalg.norm(cam_from_rig[1, 4:])),
-    )
+    posed = _posed(rig, cam_from_rig)
     sides = pair.camera_a, pair.camera_b
     for shift in SHIFTS:
         for other in shifted(shift):

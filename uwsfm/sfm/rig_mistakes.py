@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from uwsfm.rig import Rig
 from uwsfm.rig_file import FRESH_WATER
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.correction import Correction, quoted, subsets
-from uwsfm.sfm.lens_mistakes import lens_corrections
+from uwsfm.sfm.lens_mistakes import changed_lenses, lens_corrections, with_focal
 
 DOME_RADII_M = (0.05, 0.1)
 """Of domes on the market, about; any radius undoes the most of a wrong flat port."""
@@ -59,19 +60,39 @@ def _with_ports(
 def port_corrections(rig: Rig) -> Iterator[Correction]:
     """The port itself: none, missing, of the other kind, in another water."""
     for which in subsets(rig, lambda c: not isinstance(c.port, NoPort)):
-        names = quoted(rig, which)
-        yield Correction(
-            code="port_none",
-            rig=_with_ports(rig, which, lambda _: NoPort()),
-            cameras=which,
-            what=f"the lens of {names} was calibrated in the water, though the rig "
-            "file has a port",
-            remedy=f"write port: {{type: none}} for {names}, or give the lens as "
-            "calibrated in air",
-        )
+        yield _in_water(rig, which, _with_ports(rig, which, lambda _: NoPort()))
     yield from missing_ports(rig)
     yield from _other_kinds(rig)
     yield from _other_waters(rig)
+
+
+def _in_water(rig: Rig, which: tuple[int, ...], other: Rig) -> Correction:
+    names = quoted(rig, which)
+    return Correction(
+        code="port_none",
+        rig=other,
+        cameras=which,
+        what=f"the lens of {names} was calibrated in the water, though the rig file "
+        "has a port",
+        remedy=f"write port: {{type: none}} for {names}, or give the lens as "
+        "calibrated in air",
+    )
+
+
+def lenses_in_water(rig: Rig) -> Iterator[Correction]:
+    """One lens calibrated in the water, with the most of it undone: its focal length.
+
+    Closer than no port at all, where the distortion is that of the lens in air.
+    """
+    for c, item in enumerate(rig.cameras):
+        if isinstance(item.port, NoPort):
+            continue
+        factor = 1.0 / item.port.n_water
+        other = changed_lenses(rig, (c,), partial(with_focal, factor=factor))
+        if other is not None:
+            found = _in_water(rig, (c,), other)
+            zoomed = f"; else its focal length is {1.0 / factor - 1.0:.0%} too long"
+            yield replace(found, remedy=found.remedy + zoomed)
 
 
 def missing_ports(rig: Rig) -> Iterator[Correction]:

@@ -7,7 +7,7 @@ does not fit its own images.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,8 @@ NOISE = 1e-3
 """Radians, less than a pixel: where the robust loss sets in."""
 NOTABLE_TURN_DEG = 1.5
 """A relative port tilt of 6 degrees: worth a word."""
+MAX_TILT_TURN_DEG = 3.0
+"""One of 12 degrees: no port that was put in place by hand is tilted by more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,23 +45,35 @@ class RigRotation:
     """Median angle by which rays miss their epipolar plane, radians."""
     misfit_after: float
 
-    def warnings(self, rig: Rig) -> list[str]:
-        """What the user should know, one sentence each."""
+    def warnings(self, rig: Rig, causes: Mapping[int, str]) -> list[str]:
+        """What the user should know, one sentence each.
+
+        Args:
+            rig: Its cameras.
+            causes: As of `rig_check.turn_causes`.
+        """
         return [
             f"camera {camera.name!r} was turned by {turn:.1f} degrees to fit the "
-            f"images: {_cause(camera.port)}, or its cam_from_rig is wrong"
-            for camera, turn in zip(rig.cameras, self.turn_deg, strict=True)
+            f"images: {_cause(camera.port, turn, causes.get(c, ''))}"
+            for c, (camera, turn) in enumerate(
+                zip(rig.cameras, self.turn_deg, strict=True)
+            )
             if turn > NOTABLE_TURN_DEG
         ]
 
 
-def _cause(port: Port) -> str:
-    """What about a port turns the rays."""
-    if isinstance(port, FlatPort):
-        return "its port is tilted by about four times that"
+def _cause(port: Port, turn_deg: float, mistake: str) -> str:
+    """The mistake that explains a turn, if any, then what else turns the rays."""
+    words = [f"probably {mistake}; else"] if mistake else []
     if isinstance(port, DomePort):
-        return "its dome is off its centre"
-    return "its lens was calibrated in air and its port is missing in the rig file"
+        words.append("its dome is off its centre, or")
+    elif not isinstance(port, FlatPort):
+        words.append(
+            "its lens was calibrated in air and its port is missing in the rig file, or"
+        )
+    elif turn_deg <= MAX_TILT_TURN_DEG:
+        words.append("its port is tilted by about four times that, or")
+    return " ".join([*words, "its cam_from_rig is wrong"])
 
 
 def correct_rotations(

@@ -45,12 +45,15 @@ class PairMatches:
 
     def thinned(self, count: int) -> PairMatches:
         """At most ``count`` of the matches, evenly taken."""
-        step = max(-(-len(self) // count), 1)
+        return self.selected(slice(None, None, max(-(-len(self) // count), 1)))
+
+    def selected(self, rows: slice | NDArray[np.bool_]) -> PairMatches:
+        """Some of the matches: a slice, or a mask (N,)."""
         return replace(
             self,
-            frame_idx=self.frame_idx[::step],
-            xy_a=self.xy_a[::step],
-            xy_b=self.xy_b[::step],
+            frame_idx=self.frame_idx[rows],
+            xy_a=self.xy_a[rows],
+            xy_b=self.xy_b[rows],
         )
 
 

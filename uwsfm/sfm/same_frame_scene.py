@@ -12,7 +12,6 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -93,7 +92,7 @@ def same_frame_scene(rig: Rig, frames: Frames, database_path: Path) -> Scene:
         a, b = pair.camera_a, pair.camera_b
         b_from_a = relative_pose(rotation.cam_from_rig, a, b)
         gaps = ray_gaps_px(cameras[a], cameras[b], b_from_a, pair.xy_a, pair.xy_b)
-        good.append(_only(pair, gaps <= _limit(gaps, START_GAPS)))
+        good.append(pair.selected(gaps <= _limit(gaps, START_GAPS)))
     camera_idx, point_idx, xy = _tracks(good)
     return _triangulated(
         Scene.from_arrays(
@@ -155,15 +154,6 @@ def _limit(gaps_px: Array, max_gaps: float) -> float:
     known = gaps_px[np.isfinite(gaps_px)]
     median = float(np.median(known)) if len(known) else 0.0
     return max(max_gaps * median, MIN_GAP_PX)
-
-
-def _only(pair: PairMatches, keep: NDArray[np.bool_]) -> PairMatches:
-    return replace(
-        pair,
-        frame_idx=pair.frame_idx[keep],
-        xy_a=pair.xy_a[keep],
-        xy_b=pair.xy_b[keep],
-    )
 
 
 def _tracks(pairs: Sequence[PairMatches]) -> tuple[IndexArray, IndexArray, Array]:
