@@ -7,6 +7,7 @@ rig as given that ties the two motions together, without any match between them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -56,25 +57,18 @@ def mirrored_camera(
                 continue
             names = f"{rig.cameras[a].name!r} or of {rig.cameras[b].name!r}"
             what = f"the images of {names} are mirrored, {way}"
-            found.append((share, _correction(rig, what)))
+            correction = Correction(
+                code="mirrored", rig=rig, what=what, remedy=UNMIRROR
+            )
+            found.append((share, correction))
     return max(found, key=lambda item: item[0])[1] if found else None
-
-
-def _correction(rig: Rig, what: str) -> Correction:
-    return Correction(code="mirrored", rig=rig, what=what, remedy=UNMIRROR)
 
 
 def _flipped(matches: PairMatches, axis: int, size: float) -> PairMatches:
     sides = matches.xy_a.copy(), matches.xy_b.copy()
     for xy in sides:
         xy[:, axis] = size - xy[:, axis]
-    return PairMatches(
-        camera_a=matches.camera_a,
-        camera_b=matches.camera_b,
-        frame_idx=matches.frame_idx,
-        xy_a=sides[0],
-        xy_b=sides[1],
-    )
+    return replace(matches, xy_a=sides[0], xy_b=sides[1])
 
 
 def _agreement(
