@@ -282,9 +282,17 @@ def test_a_bare_baseline_is_for_two_cameras(tmp_path):
     _check_sentence(tmp_path, three, "cameras[1]: needs cam_from_rig (baseline_m is")
 
 
-def test_the_first_of_several_problems_is_told_and_the_others_counted(tmp_path):
+def test_exchanged_indices_of_glass_and_water_are_named(tmp_path):
+    text = _edited(("water/refractive_index", 1.5), (PORT + "glass_index", 1.333))
+    _check_sentence(tmp_path, text, "are they exchanged? Water has about 1.333")
+    oil = _edited(("water/refractive_index", 1.47), (PORT + "glass_index", 1.49))
+    assert _load(tmp_path, oil).cameras[0].port.n_water == 1.47
+
+
+def test_the_first_of_several_problems_is_told_and_the_others_listed(tmp_path):
     edits = [(PORT + "distance_m", 20), (PORT + "type", 3), ("version", "one")]
-    _check_sentence(tmp_path, _edited(*edits), "must be 1, not 'one' (and 1 more pro")
+    others = "must be 1, not 'one' (and 1 more problem in this file: cameras[1].port.ty"
+    _check_sentence(tmp_path, _edited(*edits), others)
     # One slip, one problem: the key that is missing for it is not counted.
     slip = (PORT + "distance_m", DELETE), (PORT + "distance_mm", 20)
     with pytest.raises(InputError, match=r"did you mean distance_m \(in metres\)\?$"):

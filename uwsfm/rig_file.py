@@ -22,7 +22,7 @@ from uwsfm._yaml import read_yaml
 from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
-from uwsfm.models.port import DomePort, NoPort
+from uwsfm.models.port import DomePort, NoPort, Port
 from uwsfm.residuals import border
 from uwsfm.rig import Rig, RigCamera
 from uwsfm.rig_problems import first_problem
@@ -127,6 +127,20 @@ def _check_covariance(rig: Rig) -> None:
             )
 
 
+GLASSY = 1.42
+"""No water, and no liquid that is dived in, bends light more."""
+
+
+def _check_order(port: Port) -> None:
+    """Refuse glass and water whose indices are exchanged."""
+    if not isinstance(port, NoPort) and port.n_glass < port.n_water > GLASSY:
+        raise InputError(
+            f"water.refractive_index: {port.n_water:g} is the index of a glass, and "
+            f"glass_index {port.n_glass:g} that of a liquid: are they exchanged? Water "
+            "has about 1.333, glass 1.5"
+        )
+
+
 def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
     port, lens = entry.port, entry.intrinsics
     conversion = None
@@ -134,6 +148,7 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         camera, conversion = lens.converted()
     else:
         camera = lens.to_camera()
+    _check_order(port.to_port(n_water))
     return RigCamera(
         name=entry.name,
         images=entry.images,
@@ -293,7 +308,7 @@ def _port_block(camera: RigCamera, n_water: float) -> dict[str, Any]:
     if isinstance(port, NoPort):
         return {"type": "none"}
     if port.n_air != 1.0:
-        raise InputError(f"{camera.name}: rig.yaml has no key for an air index != 1")
+        raise InputError(f"{camera.name}: a rig file has no key for an air index != 1")
     if isinstance(port, DomePort):
         refine = {"center": camera.refine_center}
         place: dict[str, Any] = {

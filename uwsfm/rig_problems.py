@@ -16,7 +16,7 @@ from uwsfm.rig_schema import ENTRIES, Entry
 def first_problem(
     error: ValidationError, entries: Mapping[str, type[Entry]] = ENTRIES
 ) -> str:
-    """The key path and sentence of the first problem, and how many others there are.
+    """The key path and sentence of the first problem, and the key paths of the others.
 
     Args:
         error: what pydantic found.
@@ -29,17 +29,28 @@ def first_problem(
     doubled = [p for p in problems if p["type"] == "missing" and p["loc"] in meant]
     rest = [p for p in problems if not any(p is q for q in [*unknown, *doubled])]
     first, *others = [*unknown, *rest]
-    key_path = ""
-    for part in first["loc"]:
-        if isinstance(part, int):
-            key_path += f"[{part}]"
-        elif not part.startswith("("):
-            key_path += f".{part}"
-    sentence = f"{key_path.lstrip('.')}: {_sentence(first, entries)}"
+    sentence = f"{_key_path(first)}: {_sentence(first, entries)}"
     if others:
         plural = "s" if len(others) > 1 else ""
-        sentence += f" (and {len(others)} more problem{plural} in this file)"
+        paths = list(dict.fromkeys(map(_key_path, others)))
+        if len(paths) > MAX_OTHERS:
+            paths[MAX_OTHERS:] = ["..."]
+        where = ", ".join(paths)
+        sentence += f" (and {len(others)} more problem{plural} in this file: {where})"
     return sentence
+
+
+MAX_OTHERS = 6
+
+
+def _key_path(problem: Any) -> str:
+    path = ""
+    for part in problem["loc"]:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif not part.startswith("("):
+            path += f".{part}"
+    return path.lstrip(".")
 
 
 _UNKNOWN_KEY = ("extra_forbidden", "invalid_key")

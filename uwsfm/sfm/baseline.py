@@ -120,7 +120,7 @@ def _rig_of_frames(
         raise UwsfmError(
             f"only {len(relative)} frames show both cameras in one model, at least "
             f"{MIN_FRAMES} are needed to derive cam_from_rig from baseline_m: give "
-            "cam_from_rig in rig.yaml"
+            "cam_from_rig in the rig file"
         )
     average = robust_average(relative[:: -(-len(relative) // MAX_FRAMES)])
     progress("adjusting", 0, None)

@@ -225,8 +225,9 @@ _POSES: tuple[tuple[str, str, str, Callable[[Array], Array]], ...] = (
     ),
     (
         "translation_sign",
-        "translation_m of {names} is the position of the camera",
-        "translation_m of {names} must be -R times that position",
+        "translation_m of {names} is the position of the camera, or has the wrong sign",
+        "write -R times that position, R being the rotation, as translation_m of "
+        "{names} (x_in_cam = R x_in_rig + translation_m)",
         _as_position,
     ),
     (
@@ -247,7 +248,7 @@ def image_corrections(rig: Rig) -> Iterator[Correction]:
         code="folders_swapped",
         rig=rig,
         what=f"the image folders {a.images!r} and {b.images!r} are swapped",
-        remedy="exchange them in rig.yaml",
+        remedy="exchange them in the rig file",
         exchanged=True,
     )
     for axis, text in enumerate(MIRRORED):

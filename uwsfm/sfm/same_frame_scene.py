@@ -71,7 +71,7 @@ def same_frame_scene(rig: Rig, frames: Frames, database_path: Path) -> Scene:
     if rig.cam_from_rig is None:
         raise InputError(
             "cam_from_rig: single stereo pairs cannot tell it from the ports; give it "
-            "in rig.yaml, a baseline length is not enough"
+            "in the rig file, a baseline length is not enough"
         )
     pairs = read_same_frame_matches(database_path, frames, rig)
 

@@ -11,7 +11,7 @@ matches that agree with the poses by now, so that no early mistake stays.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -77,7 +77,8 @@ def map_incrementally(
         rig: Lenses, initial ports, and what of them may be refined.
         cam_from_rig: (C, 7) that fits the initial ports.
         options: Those of the mapping are used, and the seed.
-        progress: Called with the step "mapping", in frames.
+        progress: Called with the step "mapping", in frames; a map that begins anew,
+            or is of the frames that are left, is a step of its own.
 
     Returns:
         Maps of different frames, the largest first.
@@ -109,6 +110,7 @@ class _Search:
         self.rig = rig
         self.seed = options.seed
         self.progress = progress
+        self.step = "mapping"
         self.left = np.ones(empty.correspondences.num_frames, dtype=bool)
         self.num_tried = 0
         self.max_error_px = start_tolerance_px(empty)
@@ -136,8 +138,10 @@ class _Search:
             best, rival = _better(best, growing)
             if self._in_doubt(best, rival) and num_again < MAX_AGAIN:
                 num_again += 1
+                self.step = f"mapping anew (start {num_again + 1})"
                 continue
             best.num_starts, num_again = num_again + 1, 0
+            self.step = "mapping what is left"
             self.left &= ~best.registered
             if best.num_registered > 1:
                 maps.append(best)
@@ -173,12 +177,10 @@ class _Search:
 
     def _grown(self, group: Sequence[Beginning]) -> GrowingMap:
         """The map of the beginning that explains most once all have grown a little."""
-        growers = []
+        growers, progress = [], forward_only(self.progress, self.step)
         for beginning in group:
             growing = self.empty.emptied()
-            grower = Grower(
-                growing, self.rig, self.max_error_px, self.seed, self.progress
-            )
+            grower = Grower(growing, self.rig, self.max_error_px, self.seed, progress)
             grower.begin(beginning)
             if len(group) > 1:
                 grower.grow(PROBE_FRAMES)
@@ -210,6 +212,18 @@ class _Search:
             f"{MIN_POINTS} points that other frames see too, nor do two frames; do "
             "consecutive images overlap, is the water clear enough?"
         )
+
+
+def forward_only(progress: Progress, step: str) -> Callable[[int, int], None]:
+    """Reports of maps that grow side by side: the largest so far counts."""
+    most = 0
+
+    def report(count: int, total: int) -> None:
+        nonlocal most
+        most = max(most, count)
+        progress(step, most, total)
+
+    return report
 
 
 def explained(growing: GrowingMap, max_error_px: float) -> float:
@@ -246,7 +260,7 @@ class Grower:
         rig: Rig,
         max_error_px: float,
         seed: int,
-        progress: Progress,
+        progress: Callable[[int, int], None],
     ) -> None:
         self.map = growing
         self.ranking = Ranking(growing)
@@ -272,7 +286,7 @@ class Grower:
         again once everything has been adjusted."""
         growing, total = self.map, self.map.correspondences.num_frames
         while True:
-            self.progress("mapping", growing.num_registered, total)
+            self.progress(growing.num_registered, total)
             added = None
             if growing.num_registered < num_frames:
                 added = register_next(

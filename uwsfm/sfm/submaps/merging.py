@@ -20,7 +20,7 @@ from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
-from uwsfm.sfm.mapping.incremental import Grower
+from uwsfm.sfm.mapping.incremental import Grower, forward_only
 from uwsfm.sfm.mapping.initialization import (
     MAX_ERROR_PX,
     MIN_ERROR_PX,
@@ -101,7 +101,8 @@ def merge_submaps(
         np.radians(options.mapping.min_angle_deg),
     )
     with threadpool_limits(1, user_api="blas"):
-        grower = Grower(growing, rig, MAX_ERROR_PX, options.seed, progress)
+        report = forward_only(progress, "mapping")
+        grower = Grower(growing, rig, MAX_ERROR_PX, options.seed, report)
         progress("merging", 1, 1)
         _set_housings(growing, [submaps[k] for k in chosen])
         beginning, source = _poses(placement, submaps, chosen)
