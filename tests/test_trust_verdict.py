@@ -8,13 +8,14 @@ from sfm_scenes import simulated_dive
 
 from uwsfm import DomePort
 from uwsfm.calibration.bundle_adjustment import calibrate
+from uwsfm.geometry import rigid3
 from uwsfm.rig import Rig
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, paper_rig, sample_rig, tilted_normal
 from uwsfm.simulate.trajectories import lawn_mower, rich_motion, straight_strip
-from uwsfm.trust import free_lens as free_lens_module
+from uwsfm.trust import freed as freed_module
 from uwsfm.trust.given import Departure
 from uwsfm.trust.goodness import Part, Used
 from uwsfm.trust.verdict import (
@@ -185,13 +186,13 @@ def test_a_lens_that_hides_in_ports_and_poses_is_found_by_freeing_it(dive, steps
     verdict = adjusted(scene, wrong)
     assert verdict.verdict != FITS
     assert {"lenses_do_not_fit", "lens_does_not_fit"} & set(codes(verdict))
-    free = verdict.goodness.free_lens
+    free = verdict.goodness.freed_lenses
     # Twice eight numbers, of which each saves one noise variance by chance.
     assert free.num_freed == 16 and free.gain > 3 * 16
 
 
 def test_right_lenses_save_no_more_than_chance_and_refined_ones_are_not_asked(fitting):
-    free = fitting.goodness.free_lens
+    free = fitting.goodness.freed_lenses
     assert free.num_freed == 16
     # Chi-square of 16 degrees: 0.0001 at both ends.
     assert 2.0 < free.gain < 45.0 and 1e-4 < free.p_value < 1.0
@@ -214,6 +215,37 @@ def test_a_baseline_in_another_unit_is_seen_by_the_ports(dive):
     assert reason.numbers["estimate"] == pytest.approx(0.5, abs=3.0 * stddev)
     assert "times the given one" in reason.text and "10 ± 5 mm, assumed" in reason.text
     assert verdict.goodness.floor.ratio < 1.2
+
+
+@pytest.mark.parametrize("axis,degrees", [(0, 1.0), (1, 0.5), (2, 0.3)])
+def test_a_held_rotation_that_ports_and_lenses_could_stand_for_is_found(
+    dive, axis, degrees
+):
+    """Ports that tilt, and lenses if they were free, take up most of it."""
+    scene, rig = dive
+    poses = rig.cam_from_rig.copy()
+    turn = np.zeros(6)
+    turn[axis] = np.radians(degrees)
+    poses[1, :4] = rigid3.perturb(poses[1], turn)[:4]
+    held = replace(rig, cam_from_rig=poses, refine_cam_from_rig=False)
+    wrong = adjusted(scene, held)
+    assert wrong.verdict != FITS
+    # Five numbers, three of a rotation and two of a direction, that hold the truth.
+    goodness = wrong.goodness
+    assert goodness.freed_placement.num_freed == 5
+    assert goodness.freed_placement.gain > goodness.freed_lenses.gain
+    (text,) = [r.text for r in wrong.reasons if r.code == "placement_does_not_fit"]
+    assert text.startswith("With the placement of the cameras free, ")
+    assert not [r for r in wrong.reasons if r.code.startswith("lens")]  # it is exact
+
+
+def test_a_held_placement_that_is_right_saves_no_more_than_chance(dive):
+    scene, rig = dive
+    right = adjusted(scene, replace(rig, refine_cam_from_rig=False))
+    assert right.verdict == FITS
+    # Chi-square of five degrees: 0.0001 at both ends.
+    assert 0.08 < right.goodness.freed_placement.gain < 27.0
+    assert adjusted(scene, rig).goodness.freed_placement is None
 
 
 def test_a_held_rotation_that_is_wrong_lies_above_the_noise_floor(dive):
@@ -404,14 +436,14 @@ def test_the_numbers_are_those_of_the_arrays(dive):
 
 def test_a_large_scene_is_asked_by_some_of_its_frames(dive, monkeypatch):
     scene, rig = dive
-    monkeypatch.setattr(free_lens_module, "MAX_OBSERVATIONS", 2000)
-    monkeypatch.setattr(free_lens_module, "PART", 1500)
+    monkeypatch.setattr(freed_module, "MAX_OBSERVATIONS", 2000)
+    monkeypatch.setattr(freed_module, "PART", 1500)
     right = refine_scene(replace(scene, cameras=rig.refractive_cameras()), rig)
-    found = free_lens_module.free_lens(right.calibration)
-    part = free_lens_module._some_frames(right.scene)
+    found = freed_module.freed_lenses(right.calibration)
+    part = freed_module._some_frames(right.scene)
     assert 1500 <= part.num_observations < right.scene.num_observations
     assert 1 < part.num_frames < scene.num_frames
     assert found.p_value > 1e-4
     lens = with_lens(with_lens(rig, 0, p1=0.006), 1, p1=0.006)
     wrong = refine_scene(replace(scene, cameras=lens.refractive_cameras()), lens)
-    assert free_lens_module.free_lens(wrong.calibration).p_value < LEVEL
+    assert freed_module.freed_lenses(wrong.calibration).p_value < LEVEL

@@ -19,7 +19,7 @@ from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.trust.bound import pull_below_zero
 from uwsfm.trust.central import fit_lens
-from uwsfm.trust.free_lens import FreeLens, free_lens
+from uwsfm.trust.freed import Freed, freed_lenses, freed_placement
 from uwsfm.trust.given import Departure, departures
 from uwsfm.trust.systematic import NOTHING, Systematic, systematic_part
 
@@ -90,8 +90,10 @@ class Goodness:
     converged: bool
     departures: tuple[Departure, ...]
     """Estimates against what was given."""
-    free_lens: FreeLens | None
+    freed_lenses: Freed | None
     """What vanishes of the residuals with the lenses free; None: it cannot be told."""
+    freed_placement: Freed | None
+    """The same with the placement of the cameras free, where it was held."""
     below_zero_z: float | None
     """See `pull_below_zero`; None: no port distance ran into zero."""
     known_length_z: float | None
@@ -131,7 +133,8 @@ def goodness_of(
         used=used,
         converged=calibration.summary.converged,
         departures=departures(rig, calibration),
-        free_lens=free_lens(calibration),
+        freed_lenses=freed_lenses(calibration),
+        freed_placement=freed_placement(calibration),
         below_zero_z=pull_below_zero(calibration),
         known_length_z=None
         if lengths is None

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 from uwsfm._indices import distinct
 from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
 from uwsfm.trust.departed import departed_reasons
-from uwsfm.trust.free_lens import FreeLens
+from uwsfm.trust.freed import Freed
 from uwsfm.trust.goodness import Goodness, Used, goodness_of
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 
@@ -33,10 +33,10 @@ FITS: Word = "fits"
 LEVEL = 1e-3
 """Chance at which a systematic part is significant. The test errs on the safe side: of
 200 correct simulated dives, with eight parts each, none came below 0.005."""
-FREE_LENS_LEVEL = 1e-5
-"""The same of free lenses, where errors are taken as independent: of 260 correct dives
-with outliers one had 3e-4; focal lengths 1 % too long have 1e-8 and less."""
-FREE_LENS_EVENNESS = 4.5
+FREED_LEVEL = 1e-5
+"""The same of numbers set free, where errors are taken as independent: of 260 correct
+dives with outliers one had 3e-4; focal lengths 1 % too long have 1e-8 and less."""
+FREED_EVENNESS = 4.5
 """Single outliers that were kept make 2.8 to 3.9 of it, wrong lenses 5.8 to 11."""
 NOTICEABLE_PX, NOTICEABLE_SHARE = 0.03, 0.15
 """A significant part below both is no concern: what a detector sees of slanted surfaces
@@ -202,7 +202,10 @@ def _systematic(goodness: Goodness) -> list[Reason]:
 
 
 def _lenses(goodness: Goodness) -> list[Reason]:
-    """Cameras whose residuals a free lens would remove, or all of them together."""
+    """Cameras whose residuals a free lens would remove, or what is held of the rig."""
+    together = _held_numbers(goodness)
+    if together and together[0].code == PLACEMENT:
+        return together  # which leaves in the images what a lens does, too
     reasons = []
     for camera in goodness.cameras:
         px, freed = camera.systematic_px, camera.freed_px
@@ -217,34 +220,64 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         )
         numbers = {"px": px, "p_value": camera.p_value, "freed_px": freed}
         reasons.append(reason("lens_does_not_fit", text, severity, **numbers))
-    free = goodness.free_lens
-    if reasons or free is None:
-        return reasons
-    severity = _severity(free.px, free.p_value, goodness.sigma_px)
-    if severity is None or not _seen_by_all(free):
-        return []
+    return reasons or together
+
+
+PLACEMENT = "placement_does_not_fit"
+
+
+def _held_numbers(goodness: Goodness) -> list[Reason]:
+    """All lenses together or the placement of the cameras, whichever as held costs
+    more: each can stand for a part of the other."""
+    tried = {
+        "lenses_do_not_fit": (goodness.freed_lenses, "lenses"),
+        "placement_does_not_fit": (
+            goodness.freed_placement,
+            "placement of the cameras",
+        ),
+    }
+    found = []
+    for code, (freed, name) in tried.items():
+        if freed is None or not _seen_by_all(freed):
+            continue
+        severity = _severity(freed.px, freed.p_value, goodness.sigma_px)
+        if severity is not None:
+            text = _freed_text(freed, name, goodness.floor)
+            numbers = {"px": freed.px, "p_value": freed.p_value, "gain": freed.gain}
+            found.append(reason(code, text, severity, **numbers))
+    return sorted(found, key=lambda one: -one.numbers["px"])[:1]
+
+
+def _freed_text(freed: Freed, name: str, floor: NoiseFloor | None) -> str:
+    lenses = name == "lenses"
     text = (
-        f"With the lenses free, {free.px:.2g} px of the residuals vanish "
-        f"({_chance(free.p_value)}): "
+        f"With the {name} free, {freed.px:.2g} px of the residuals vanish "
+        f"({_chance(freed.p_value)}): "
     )
-    floor = goodness.floor
-    if floor is None or free.sigma_px < ABOVE_FLOOR * floor.floor_px:
-        text += (
+    if floor is not None and freed.sigma_px >= ABOVE_FLOOR * floor.floor_px:
+        others = (
+            "lenses alone; check the placement of the cameras"
+            if lenses
+            else "placement alone; check the lenses"
+        )
+        return text + (
+            f"but a noise of {freed.sigma_px:.2g} px is left, where matches of pairs "
+            f"of images alone have {floor.floor_px:.2g} px, so it is not the {others} "
+            "and the ports as well."
+        )
+    if lenses:
+        return text + (
             "the lenses, as given, do not fit, or something that a lens can stand for; "
             "check their calibration."
         )
-    else:
-        text += (
-            f"but a noise of {free.sigma_px:.2g} px is left, where matches of pairs of "
-            f"images alone have {floor.floor_px:.2g} px, so it is not the lenses "
-            "alone; check the placement of the cameras and the ports as well."
-        )
-    numbers = {"px": free.px, "p_value": free.p_value, "gain": free.gain}
-    return [reason("lenses_do_not_fit", text, severity, **numbers)]
+    return text + (
+        "cam_from_rig, as held, does not fit, or something that it can stand for; "
+        "check it, or write refine_cam_from_rig: true."
+    )
 
 
-def _seen_by_all(free: FreeLens) -> bool:
-    return free.p_value < FREE_LENS_LEVEL and free.evenness > FREE_LENS_EVENNESS
+def _seen_by_all(freed: Freed) -> bool:
+    return freed.p_value < FREED_LEVEL and freed.evenness > FREED_EVENNESS
 
 
 def _severity(px: float, p_value: float, sigma_px: float) -> Severity | None:
