@@ -13,7 +13,7 @@ from uwsfm.cli_check import explanations_table
 from uwsfm.console import console
 from uwsfm.errors import InputError
 from uwsfm.export.files import RIG_GIVEN
-from uwsfm.trust.diagnosis import Explanation
+from uwsfm.trust.explanation import Explanation
 
 
 @pytest.fixture

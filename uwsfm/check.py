@@ -9,7 +9,8 @@ from typing import Any
 from uwsfm._progress import Progress, silent
 from uwsfm.export.summary import write_json
 from uwsfm.result_folder import given_rig, open_result
-from uwsfm.trust.diagnosis import Explanation, diagnose, options_of
+from uwsfm.trust.diagnosis import diagnose, options_of
+from uwsfm.trust.explanation import Explanation
 
 CHECK = "check.json"
 

@@ -13,7 +13,7 @@ from uwsfm.cli_results import finish
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from uwsfm.trust.diagnosis import Explanation
+    from uwsfm.trust.explanation import Explanation
 
 
 def check(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,13 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.lens_mistakes import OF_DISTORTION
 from uwsfm.solver.threads import limited
+from uwsfm.trust.explanation import (
+    AS_GOOD,
+    CLEAR,
+    Explanation,
+    Tried,
+    explanations,
+)
 from uwsfm.trust.midway import (
     ZoomTrial,
     coarse_firsts,
@@ -33,59 +40,13 @@ from uwsfm.trust.mistakes import Trial, length_trials, trials
 from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
 from uwsfm.trust.verdict import FITS
 
-UNIT = 0.02
-"""A fall of the RMS by so much, relative, counts one; so do the strains below."""
-CLEAR = 1.5
-"""An explanation must be better than the rig as given by so many."""
-TIE = 1.5
-"""Explanations nearer than this to the best cannot be told apart."""
 MAX_TILT_DEG = 15.0
 """Of a flat port; more is no usual housing."""
 RULER_M, RULER_SHARE = 0.01, 0.5
 """What a port's distance in a rig file is taken to be known to: a ruler held against a
 housing, to the centre of a lens that nobody sees."""
-AS_GOOD = 0.5
-"""A hypothesis fits as well as another that contains it: 1 % of the RMS of some 4000
-coordinates is 80 of chi square, where a dozen free numbers take a dozen."""
 AT_ZERO = 2.0
 """Strain of a port that came out at its lens, which no housing has."""
-MAX_EXPLANATIONS = 3
-OF_WHAT = "of the best 90 % of a sample of the observations"
-"""See `uwsfm.trust.trials`: a mistake makes outliers of good matches."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explanation:
-    """A mistake that explains the observations."""
-
-    code: str
-    """See `uwsfm.sfm.correction.CODES`."""
-    text: str
-    """A sentence for people: the mistake, its evidence, and what to change."""
-    rms_before_px: float
-    """Of the best 90 % of the observations, with the rig as given."""
-    rms_after_px: float
-    """With the mistake undone."""
-    gain: float
-    """How much better, in steps of 2 % of the RMS; ports and placement that stay near
-    the rig file's count as well."""
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-@dataclass(frozen=True)
-class Tried:
-    """One trial and what came of it."""
-
-    trial: Trial
-    fit: Fit
-    strain: float
-    """How implausible its numbers are, in steps of 2 % of the RMS."""
-
-    @property
-    def total(self) -> float:
-        return math.log(max(self.fit.rms_px, 1e-9)) / UNIT + self.strain
 
 
 def explain(
@@ -283,82 +244,3 @@ def _distance_strain(distance: float, given: float) -> float:
 
 def _beyond(value: float, usual: float, step: float) -> float:
     return min(max(value - usual, 0.0) / step, 8.0)
-
-
-def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]:
-    """Those that are clearly better, one of each kind: best first, and before it what
-    leaves clearly smaller residuals."""
-    better = [one for one in tried if base.total - one.total >= CLEAR]
-    better.sort(key=lambda one: one.total)
-    chosen: list[Tried] = []
-    for one in better:
-        if one.total - better[0].total > TIE:
-            break
-        if all(one.trial.code != other.trial.code for other in chosen):
-            chosen.append(_of_fewest_cameras(one, better))
-    # Of those that cannot be told apart, what the images say goes before what is usual.
-    limit = min((one.fit.rms_px for one in chosen), default=0.0) * (1.0 + CLEAR * UNIT)
-    chosen.sort(key=lambda one: (one.fit.rms_px > limit, one.total))
-    return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
-
-
-def _of_fewest_cameras(best: Tried, better: Iterable[Tried]) -> Tried:
-    """The trial of the same kind that accuses the fewest cameras and explains as well:
-    numbers that are right and set free change nothing, and fit no worse."""
-    as_good = (
-        one
-        for one in better
-        if one.trial.code == best.trial.code and one.total - best.total <= AS_GOOD
-    )
-
-    def rank(one: Tried) -> tuple[int, float]:
-        concerned = one.trial.cameras or one.trial.rig.cameras
-        return len(concerned), one.total
-
-    return min(as_good, key=rank)
-
-
-def _explained(base: Tried, one: Tried) -> Explanation:
-    before, after = base.fit.rms_px, one.fit.rms_px
-    evidence = [f"the RMS error {OF_WHAT} falls from {before:.2f} to {after:.2f} px"]
-    if before < after * (1.0 + UNIT):
-        evidence = [f"the RMS error {OF_WHAT} stays at {after:.2f} px"]
-    evidence += [*_port_evidence(base, one), *_turn_evidence(base, one)]
-    told, remedy = one.trial.estimate(one.fit), one.trial.remedy
-    return Explanation(
-        code=one.trial.code,
-        text=f"Probably {one.trial.what}{told}. Without this mistake "
-        f"{', '.join(evidence)}. {remedy[0].upper()}{remedy[1:]}.",
-        rms_before_px=before,
-        rms_after_px=after,
-        gain=base.total - one.total,
-    )
-
-
-def _port_evidence(base: Tried, one: Tried) -> list[str]:
-    before, after = base.fit.distances_m(), one.fit.distances_m()
-    given = [
-        item.port.distance
-        for item in one.trial.rig.cameras
-        if isinstance(item.port, FlatPort)
-    ]
-    if not before or base.strain < 1.0:
-        return []
-    text = f"ports at {_millimetres(before)}"
-    if after and np.allclose(before, after, rtol=0.1, atol=1e-3):
-        return []
-    if after:
-        text += f" become {_millimetres(after)} (rig file: {_millimetres(given)})"
-        return [text]
-    return [f"{text} are no more needed"]
-
-
-def _turn_evidence(base: Tried, one: Tried) -> list[str]:
-    before, after = base.fit.turn_deg, one.fit.turn_deg
-    if before < 0.5 or after > 0.5 * before:
-        return []
-    return [f"and cam_from_rig turns by {after:.1f} degrees in place of {before:.1f}"]
-
-
-def _millimetres(values: Sequence[float]) -> str:
-    return " and ".join(f"{1e3 * value:.0f}" for value in values) + " mm"

@@ -29,8 +29,8 @@ from uwsfm.sfm.rig_mistakes import (
 from uwsfm.trust.trials import Fit, adjusted
 
 RARER = {"dome_as_flat": 1.0, "water_index": 0.6}
-"""Handicap of what looks like a lens calibrated in the water, and happens less. The
-centre of a dome is free, and a centred one is no port at all: it always fits better."""
+"""Handicap of what looks like a lens calibrated in the water, and happens less; a dome,
+whose centre is free, always fits better."""
 MIN_FRAMES_LEFT = 2
 """On each side of a frame from which on something changed."""
 UNITS = {
