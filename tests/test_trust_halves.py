@@ -32,7 +32,13 @@ from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
 from uwsfm.trust import halves as halves_module
 from uwsfm.trust.goodness import Used
-from uwsfm.trust.halves import IN_ORDER, INTERLEAVED, CrossValidation, cross_validate
+from uwsfm.trust.halves import (
+    IN_ORDER,
+    INTERLEAVED,
+    CrossValidation,
+    _differences,
+    cross_validate,
+)
 from uwsfm.trust.halves_reason import FAR_APART, halves_reasons, untested_notes
 from uwsfm.trust.projections import projection_map
 from uwsfm.trust.shared_numbers import shared_numbers
@@ -352,3 +358,26 @@ def test_a_result_without_a_model_is_refused_as_wrong_input(tmp_path):
     shown = CliRunner().invoke(app, ["check", str(tmp_path), "--halves"])
     assert isinstance(shown.exception, InputError)
     assert "is a result of uwsfm calibrate" in str(shown.exception)
+
+
+def test_lengths_of_a_scale_that_is_hardly_known_are_compared_by_their_shape():
+    """Behind a flat port of a known distance one camera knows its scale by half: two
+    halves a factor of 1.7 apart agree, and one whose lengths differ by 2 % does not."""
+    rng = np.random.default_rng(5)
+    first = rng.uniform(0.3, 2.0, 40)
+    noise, loose = np.diag((1e-3 * first) ** 2), np.outer(first, first) * 0.4**2
+    covariances = [noise + loose, 1.7**2 * (noise + loose)]
+
+    def size(spread: float) -> float:
+        second = 1.7 * first * (1.0 + spread * rng.standard_normal(len(first)))
+        found, covariance = _differences([first, second], covariances, 1.7)
+        return float(np.sqrt(np.mean(found**2 / np.diag(covariance))))
+
+    # One half is noisy here and two are predicted, so the mean square is 0.5; of forty
+    # numbers it has a standard deviation of 0.11.
+    assert 0.1 < size(1e-3) ** 2 < 0.9
+    assert size(2e-2) > 8.0
+    # What is known well keeps its scale: 1.7 is far from one then.
+    gaps, covariance = _differences([first, 1.7 * first], [noise, noise], 1.7)
+    np.testing.assert_allclose(gaps, 0.7 * first)
+    np.testing.assert_allclose(covariance, 2.0 * noise)

@@ -33,6 +33,9 @@ MIN_OBSERVATIONS = 200
 """In each half."""
 LITTLE_WORK = 100_000
 """Observations that are cross-validated without being asked: a second or so."""
+LOOSE_SCALE = 0.1
+"""Predicted relative deviation of a distance in both halves, median: one that a length
+scales has a hundredth and less."""
 MAX_LENGTHS = 60
 """Distances between pairs of points that are compared."""
 MEDIAN_NORMAL = 0.6745
@@ -314,7 +317,7 @@ def _compared_lengths(
     if count < 2:
         return None
     chosen = np.random.default_rng(seed).permutation(common)[: 2 * count]
-    found, places, covariance = [], [], np.zeros((count, count))
+    found, places, covariances = [], [], []
     for half in halves:
         scene = half.calibration.scene
         index = np.searchsorted(half.point_idx, chosen)
@@ -329,15 +332,16 @@ def _compared_lengths(
         alone = propagation.covariance(ends, slopes)
         shared = propagation.clustered_covariance(ends, slopes)
         raised = np.sqrt(np.maximum(np.diag(shared) / np.diag(alone), 1.0))
-        covariance += raised[:, None] * alone * raised
+        covariances.append(raised[:, None] * alone * raised)
         found.append(lengths)
         places.append(scene.points[np.searchsorted(half.point_idx, common)])
-    gaps, stddevs = found[1] - found[0], np.sqrt(np.diag(covariance))
+    moved = align(places[0], places[1], np.ones(len(common)), with_scale=True)
+    gaps, covariance = _differences(found, covariances, moved.scale)
+    stddevs = np.sqrt(np.diag(covariance))
     known = [half.calibration.covariance.scale_stddev for half in halves]
     predicted = None
     if known[0] is not None and known[1] is not None:
         predicted = float(np.hypot(known[0], known[1]))
-    moved = align(places[0], places[1], np.ones(len(common)), with_scale=True)
     report = Lengths(
         num_pairs=count,
         typical_m=float(np.median(found[0])),
@@ -347,3 +351,27 @@ def _compared_lengths(
         scale_stddev=predicted,
     )
     return report, gaps / stddevs, covariance
+
+
+def _differences(
+    lengths: Sequence[Array], covariances: Sequence[Array], scale: float
+) -> tuple[Array, Array]:
+    """Differences (K,) of lengths in two halves, and their covariance (K, K).
+
+    A scale that only a port's distance hints at is unknown by half, and far from
+    linear: it is taken out, and what is left is the shape.
+
+    Args:
+        lengths: (K,) of each half.
+        covariances: (K, K) of each.
+        scale: of the second half over the first.
+    """
+    gaps, covariance = lengths[1] - lengths[0], covariances[0] + covariances[1]
+    relative = np.sqrt(np.diag(covariance)) / lengths[0]
+    if np.median(relative) < LOOSE_SCALE:
+        return gaps, covariance
+    gaps = lengths[1] / scale - lengths[0]
+    covariance = covariances[0] + covariances[1] / scale**2
+    along = lengths[0] / np.linalg.norm(lengths[0])
+    across = np.eye(len(along)) - along[:, None] * along
+    return across @ gaps, across @ covariance @ across.T
