@@ -15,6 +15,7 @@ import argparse
 import ast
 import difflib
 import hashlib
+import importlib
 import json
 import os
 import random
@@ -23,9 +24,10 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,49 +37,60 @@ COPIED = ("uwsfm", "tests", "datasets", "pyproject.toml")
 LEAST_SECONDS = 30.0
 """Of the time limit; else `PATIENCE` times what the tests take without a fault."""
 PATIENCE = 5.0
+WIDE = 150
+"""Characters of a line that is shown whole; of longer ones, what is around the fault."""
 
-GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "console": (
-        ("console.py", "result_tables.py", "evaluate.py"),
-        ("test_printed_tables.py", "test_comparison.py"),
-    ),
-    "summary": (
-        (
-            *("export/summary.py", "export/verdict_summary.py", "export/housing.py"),
-            *("export/halves_summary.py", "export/files.py", "surface/units.py"),
-            *("surface/geotiff.py", "calibration/tilt.py"),
-        ),
-        ("test_summary_numbers.py", "test_housing_comments.py", "test_written_units.py"),
-    ),
-    "report": (
-        (
-            *("report/words.py", "report/tables.py", "report/page.py"),
-            *("report/halves.py", "report/gather.py", "report/left_files.py"),
-            *("report/view.py", "report/pictures.py"),
-        ),
-        ("test_report_words.py", "test_report_numbers.py"),
-    ),
-    "measuring": (
-        (
-            *("measuring/measure.py", "measuring/table.py", "measuring/quantities.py"),
-            *("measuring/spots.py", "measuring/surface.py", "measuring/picks.py"),
-            "measuring/measurements_file.py",
-        ),
-        ("test_measure_table.py", "test_measure_quantities.py", "test_measure_picks.py"),
-    ),
-    "known lengths": (
-        (
-            *("known_lengths.py", "lengths_file.py", "calibration/lengths.py"),
-            "calibration/length_verdicts.py",
-        ),
-        ("test_known_lengths.py", "test_lengths_file.py"),
-    ),
-    "step keys": (
-        ("sfm/steps.py", "sfm/start.py", "sfm/refractive_steps.py", "dense/maps.py"),
-        ("test_sfm_steps.py", "test_stale_work.py"),
-    ),
+_TABLES = ("test_printed_tables.py",)
+_SUMMARY = ("test_summary_numbers.py",)
+_REPORT = ("test_report_words.py", "test_report_numbers.py")
+_MEASURED = ("test_measure_table.py",)
+_LENGTHS = ("test_known_lengths.py", "test_lengths_file.py", "test_length_verdicts.py")
+_STEPS = ("test_sfm_steps.py", "test_stale_work.py")
+_PIPE = "test_verdict_shown.py::test_a_pipe_is_wide_enough_and_a_terminal_as_wide_as_it_is"
+
+GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
+    "console": {
+        "console.py": (*_TABLES, "test_progress_display.py", "test_signals.py", _PIPE),
+        "result_tables.py": _TABLES,
+        "evaluate.py": ("test_comparison.py",),
+    },
+    "summary": {
+        "export/summary.py": _SUMMARY,
+        "export/verdict_summary.py": _SUMMARY,
+        "export/halves_summary.py": _SUMMARY,
+        "calibration/tilt.py": _SUMMARY,
+        "export/housing.py": ("test_housing_comments.py",),
+        "export/files.py": ("test_written_units.py",),
+        "surface/units.py": ("test_written_units.py",),
+        "surface/geotiff.py": ("test_written_units.py",),
+    },
+    "report": {
+        f"report/{name}.py": _REPORT
+        for name in ("words", "tables", "page", "halves", "gather", "left_files", "view")
+    },
+    "measuring": {
+        "measuring/measure.py": _MEASURED,
+        "measuring/table.py": _MEASURED,
+        "measuring/quantities.py": ("test_measure_quantities.py",),
+        "measuring/spots.py": _MEASURED,
+        "measuring/surface.py": _MEASURED,
+        "measuring/picks.py": ("test_measure_picks.py",),
+        "measuring/measurements_file.py": ("test_measure_picks.py",),
+    },
+    "known lengths": {
+        "known_lengths.py": _LENGTHS,
+        "lengths_file.py": _LENGTHS,
+        "calibration/lengths.py": _LENGTHS,
+        "calibration/length_verdicts.py": _LENGTHS,
+    },
+    "step keys": {
+        "sfm/steps.py": _STEPS,
+        "sfm/start.py": _STEPS,
+        "sfm/refractive_steps.py": _STEPS,
+        "dense/maps.py": _STEPS,
+    },
 }
-"""Modules of a kind, and the fast tests that concern them."""
+"""Modules of a kind, and the fast tests that concern each."""
 
 
 # ---- Faults -------------------------------------------------------------------------
@@ -126,7 +139,10 @@ _EXCHANGED = {
     **{"asin": "sin", "nanmean": "nansum", "median": "mean", "argmin": "argmax"},
     **{"hypot": "dist", "nanmedian": "nanmean", "floor": "ceil", "minimum": "maximum"},
 }
-_IDENTITIES = ("sqrt", "abs", "degrees", "radians", "asin", "nan_to_num", "float")
+_IDENTITIES = ("sqrt", "abs", "degrees", "radians", "asin", "nan_to_num")
+_FORM = {"strict", "encoding", "title_justify", "caption_justify", "no_wrap", "title"}
+_FORM |= {"show_header", "style", "justify", "fontsize", "frameon"}
+"""Arguments that change no number: checks, encodings, layout."""
 _UNITS = {
     **{"mm": "m", "m": "mm", "px": "mm", "deg": "rad", "%": "", "cm2": "m2"},
     **{"m2": "cm2", "metre": "millimetre", "x": "y", "y": "x", "s": "ms"},
@@ -174,7 +190,14 @@ def _difference(plain: list[str], text: list[str]) -> tuple[str, str]:
         last += 1
     parts = (lines[first : len(lines) - last] for lines in (plain, text))
     lost, got = (" ".join(line.strip() for line in part) for part in parts)
-    return lost, got
+    if max(len(lost), len(got)) <= WIDE:
+        return lost, got
+    same = len(os.path.commonprefix([lost, got]))
+    rest = len(os.path.commonprefix([lost[same:][::-1], got[same:][::-1]]))
+    start = max(0, same - WIDE // 3)
+    cut = (text[start : len(text) - rest + WIDE // 3] for text in (lost, got))
+    first_cut, second_cut = cut
+    return first_cut, second_cut
 
 
 _Edit = tuple[int, str, ast.AST, str, int | None, Any]
@@ -209,6 +232,8 @@ def _expressions(scope: ast.AST) -> Iterator[_Place]:
             for index, child in enumerate(value if many else [value]):
                 if not isinstance(child, ast.AST) or _is_left_alone(child, node):
                     continue
+                if isinstance(child, ast.keyword) and child.arg in _FORM:
+                    continue
                 at = getattr(child, "lineno", line)
                 if isinstance(node, (ast.JoinedStr, ast.FormattedValue)):
                     at = line  # places inside are not right before Python 3.12
@@ -223,6 +248,8 @@ def _is_left_alone(child: ast.AST, holder: ast.AST) -> bool:
     if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Import)):
         return True
     if isinstance(child, (ast.ImportFrom, ast.Assert, ast.Global, ast.arguments)):
+        return True
+    if isinstance(holder, ast.Call) and getattr(holder.func, "id", "") == "isinstance":
         return True
     if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
         return True
@@ -340,9 +367,13 @@ class _Names:
     _list = _tuple
 
     def _call(self, node: ast.Call) -> Iterator[tuple[str, ast.AST]]:
+        if getattr(node.func, "id", "") == "isinstance":
+            return
         for k in range(len(node.args) - 1):
             yield "exchanged", ast.Call(node.func, _swapped(node.args, k), node.keywords)
-        for k in range(len(node.keywords)):
+        for k, keyword in enumerate(node.keywords):
+            if keyword.arg in _FORM:
+                continue
             kept = [*node.keywords[:k], *node.keywords[k + 1 :]]
             yield "left out", ast.Call(node.func, node.args, kept)
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
@@ -404,28 +435,56 @@ def _copy(work: Path) -> Path:
     return tree
 
 
-def _load_packages(tree: Path) -> None:
-    """Import once what every test process needs, but nothing of the package."""
-    import cv2  # noqa: F401
-    import matplotlib.figure  # noqa: F401
-    import numba  # noqa: F401
-    import plotly.offline  # noqa: F401
-    import pycolmap  # noqa: F401
-    import pydantic  # noqa: F401
-    import pytest  # noqa: F401
-    import rich.table  # noqa: F401
-    import scipy.optimize  # noqa: F401
-    import scipy.spatial  # noqa: F401
-    import typer.testing  # noqa: F401
+def _load_package(tree: Path) -> dict[str, set[str]]:
+    """Import the whole copy once; names of its modules with those that import them.
 
+    A test process begins as a copy of this one, and imports again what depends on the
+    module with the fault (`_forget`): the kernels below it are there already.
+    """
     sys.dont_write_bytecode = True  # a fault may have the size and the second of another
     os.chdir(tree)
     sys.path[:0] = [str(tree), str(tree / "tests")]
     os.environ["PYTHONPATH"] = str(tree)
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    for name in ("matplotlib.figure", "plotly.offline", "pytest", "typer.testing"):
+        importlib.import_module(name)
+    users: dict[str, set[str]] = {}
+    for path in sorted((tree / "uwsfm").rglob("*.py")):
+        name = ".".join(path.relative_to(tree).with_suffix("").parts)
+        name = name.removesuffix(".__init__")
+        if path.name == "__main__.py":
+            continue
+        importlib.import_module(name)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                for item in node.names:
+                    users.setdefault(item.name, set()).add(name)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                used = {node.module, *(f"{node.module}.{n.name}" for n in node.names)}
+                for item in used:
+                    users.setdefault(item, set()).add(name)
+    return users
 
 
-def _tested(tests: Sequence[str], log: Path, limit: float | None) -> tuple[str, float]:
+def _forget(module: str, users: Mapping[str, set[str]]) -> None:
+    """Let a module be imported again, and all that imports it."""
+    todo, stale = [module], set()
+    while todo:
+        name = todo.pop()
+        if name not in stale:
+            stale.add(name)
+            todo += users.get(name, ())
+    for name in stale & set(sys.modules):
+        del sys.modules[name]
+
+
+def _tested(
+    tests: Sequence[str],
+    log: Path,
+    limit: float | None,
+    prepare: Callable[[], None] = lambda: None,
+) -> tuple[str, float]:
     """Run tests in a process of its own: "passed", "failed" or "timeout"; seconds."""
     start = time.monotonic()
     child = os.fork()
@@ -436,9 +495,10 @@ def _tested(tests: Sequence[str], log: Path, limit: float | None) -> tuple[str, 
             out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             for stream in (1, 2):
                 os.dup2(out, stream)
+            prepare()
             import pytest
 
-            flags = ["-o", "addopts=", "-m", "not slow", "-x", "-q", "--tb=line"]
+            flags = ["-o", "addopts=--strict-markers", "-m", "not slow", "-x", "-q", "--tb=line"]
             code = int(pytest.main([*flags, "-p", "no:cacheprovider", *tests]))
         os._exit(code)
     while True:
@@ -453,6 +513,15 @@ def _tested(tests: Sequence[str], log: Path, limit: float | None) -> tuple[str, 
             os.waitpid(child, 0)
             return "timeout", seconds
         time.sleep(0.02)
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """The copy of the package, imported."""
+
+    tree: Path
+    users: Mapping[str, set[str]]
+    """Modules that import a module."""
 
 
 class _Results:
@@ -489,22 +558,24 @@ def equivalent() -> dict[tuple[str, str, str], str]:
 
 
 def run_group(
-    name: str, options: argparse.Namespace, tree: Path, results: _Results
+    name: str, options: argparse.Namespace, copy: _Copy, results: _Results
 ) -> Iterator[tuple[Fault, str]]:
     """Faults of a group of modules and what became of each.
 
     Raises:
         SystemExit: the tests fail without a fault.
     """
-    modules, names = GROUPS[name]
-    tests = [f"tests/{test}" for test in names]
-    texts = [(tree / test).read_bytes() for test in tests]
-    mark = hashlib.sha1(b"".join(texts)).hexdigest()[:12]
-    same, limit = equivalent(), None
-    for module in modules:
+    same = equivalent()
+    limits: dict[tuple[str, ...], float] = {}
+    for module, names in GROUPS[name].items():
         if options.module and module not in options.module:
             continue
-        path = tree / "uwsfm" / module
+        tests = [f"tests/{test}" for test in names]
+        texts = [(copy.tree / test.partition("::")[0]).read_bytes() for test in tests]
+        mark = hashlib.sha1(b"".join(texts)).hexdigest()[:12]
+        path = copy.tree / "uwsfm" / module
+        dotted = "uwsfm." + module.removesuffix(".py").replace("/", ".")
+        prepare = partial(_forget, dotted, copy.users)
         source, status = path.read_text(encoding="utf-8"), path.stat()
         for fault, text in chosen(module, source, options.count, options.seed):
             if (module, fault.before, fault.after) in same:
@@ -513,14 +584,14 @@ def run_group(
             outcome = results.outcome(fault, mark)
             if outcome is None:
                 log = options.work / "log.txt"
-                if limit is None:
+                if names not in limits:
                     state, seconds = _tested(tests, log, None)
                     if state != "passed":
-                        sys.exit(f"the tests of {name} fail without a fault: see {log}")
-                    limit = max(LEAST_SECONDS, PATIENCE * seconds)
+                        sys.exit(f"{module}: tests fail without a fault: see {log}")
+                    limits[names] = max(LEAST_SECONDS, PATIENCE * seconds)
                 try:
                     path.write_text(text, encoding="utf-8")
-                    state, _ = _tested(tests, log, limit)
+                    state, _ = _tested(tests, log, limits[names], prepare)
                 finally:
                     path.write_text(source, encoding="utf-8")
                     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -541,7 +612,7 @@ def main() -> int:
     options = parser.parse_args()
     options.work = options.work.resolve()
     tree = _copy(options.work)
-    _load_packages(tree)
+    copy = _Copy(tree, _load_package(tree))
     results = _Results(options.work / "results.jsonl")
     survivors: list[Fault] = []
     totals: Counter[str] = Counter()
@@ -549,7 +620,7 @@ def main() -> int:
     print("|---|---|---|---|---|---|")
     for group in options.group or GROUPS:
         counts: dict[str, Counter[str]] = {}
-        for fault, outcome in run_group(group, options, tree, results):
+        for fault, outcome in run_group(group, options, copy, results):
             outcome = "killed" if outcome == "timeout" else outcome
             counts.setdefault(fault.module, Counter())[outcome] += 1
             if outcome == "survived":
