@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -9,6 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from uwsfm._files import PARTIAL, replaced_file
 from uwsfm.sfm.background import damaged
@@ -18,9 +21,24 @@ FORMAT = 1
 
 
 def fingerprint(inputs: Any) -> str:
-    """A short hash of anything JSON can hold."""
-    text = json.dumps(inputs, sort_keys=True, default=str)
+    """A short hash of anything JSON can hold, paths, arrays and dataclasses included."""
+    text = json.dumps(inputs, sort_keys=True, default=_as_json)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _as_json(value: Any) -> Any:
+    """Every number of an array, which as text has only the first and the last ones.
+
+    Raises:
+        TypeError: it is something else, of which a text might hide a change.
+    """
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"no step may depend on {type(value).__name__}")
 
 
 class Steps:

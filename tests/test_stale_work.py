@@ -1,0 +1,469 @@
+"""Touch one input of a run: exactly the steps that depend on it are done again."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hand_made_result import result_of, small_model
+
+from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
+from uwsfm.dense.depth_map import DepthMap, write_depth_map
+from uwsfm.dense.maps import DepthMaps
+from uwsfm.errors import InputError
+from uwsfm.export.calibration_file import fingerprint as model_fingerprint
+from uwsfm.models.port import FlatPort
+from uwsfm.result_folder import Result
+from uwsfm.sfm.images import find_frames
+from uwsfm.sfm.options import (
+    FeatureOptions,
+    MappingOptions,
+    MatchOptions,
+    StartOptions,
+    VerificationOptions,
+)
+from uwsfm.sfm.start import match_images, start_from_matches
+from uwsfm.sfm.steps import Steps, fingerprint
+from uwsfm.sfm.workspace import Workspace
+from uwsfm.simulate.rigs import sample_rig
+
+NAMES = ("0001.png", "0002.png", "0003.png")
+
+
+class Finished(Exception):
+    """Mapping would be next."""
+
+
+class Keys(Steps):
+    """Notes what each step depends on, and does none of them."""
+
+    def __init__(self, work_dir: Path) -> None:
+        super().__init__(work_dir)
+        self.keys: dict[str, str] = {}
+
+    def run(self, name, inputs, action, *, outputs, clear=None):
+        self.keys[name] = fingerprint(inputs)
+        if name == "mapping":
+            raise Finished
+        return self.keys[name]
+
+
+@pytest.fixture
+def images(tmp_path):
+    """Three frames of two cameras; only names, sizes and times of files are read."""
+    for folder in ("left", "right"):
+        (tmp_path / "images" / folder).mkdir(parents=True)
+        for k, name in enumerate(NAMES):
+            path = tmp_path / "images" / folder / name
+            path.write_bytes(b"x" * (5 + k))
+            os.utime(path, ns=(10**18, 10**18))
+    masks = tmp_path / "masks" / "left"
+    masks.mkdir(parents=True)
+    for name in NAMES[:2]:
+        (masks / f"{name}.png").write_bytes(b"mask")
+        os.utime(masks / f"{name}.png", ns=(10**18, 10**18))
+    return tmp_path / "images"
+
+
+RIG = replace(sample_rig(), accuracy=RigAccuracy())
+REFRACTIVE = StartOptions(mapper="refractive")
+
+
+def keys_of(images, rig=RIG, options=REFRACTIVE):
+    """The key of each step of a run on these images."""
+    steps = Keys(images.parent / "work")
+    space = Workspace(work_dir=steps.work_dir)
+    pycolmap.Database.open(str(space.features)).close()
+    space.rig.write_text(json.dumps(sample_rig().cam_from_rig.tolist()))
+    frames = find_frames(images, rig)
+    key = match_images(rig, frames, steps, space, options, print)
+    with pytest.raises(Finished):
+        start_from_matches(rig, frames, steps, key, options)
+    return steps.keys
+
+
+def again(before, after):
+    """Steps of the second run that are not done yet."""
+    return [name for name, key in after.items() if before.get(name) != key]
+
+
+FRONT = ["features", "matches"]
+GEOMETRY = ["verification", "mapping"]
+ALL = FRONT + GEOMETRY
+
+
+def test_nothing_is_done_again_where_nothing_changed(images):
+    before = keys_of(images)
+    assert list(before) == ALL and again(before, keys_of(images)) == []
+    assert len(set(before.values())) == 4
+
+
+def touched(path, size=None):
+    if size is not None:
+        path.write_bytes(b"y" * size)
+    os.utime(path, ns=(10**18, 10**18 + 1))
+
+
+@pytest.mark.parametrize("folder", ["left", "right"])
+@pytest.mark.parametrize("name", NAMES)
+def test_an_image_that_was_replaced_is_searched_again(images, folder, name):
+    before = keys_of(images)
+    touched(images / folder / name)
+    assert again(before, keys_of(images)) == ALL
+    path = images / folder / name
+    path.write_bytes(b"another size")
+    os.utime(path, ns=(10**18, 10**18))
+    assert again(before, keys_of(images)) == ALL
+
+
+def test_more_and_fewer_images_are_other_images(images):
+    before = keys_of(images)
+    for folder in ("left", "right"):
+        (images / folder / "0004.png").write_bytes(b"x")
+    assert again(before, keys_of(images)) == ALL
+    for name in ("0003.png", "0004.png"):
+        (images / "right" / name).unlink()
+    assert again(before, keys_of(images)) == ALL
+
+
+def test_masks_that_changed_came_or_went_are_used(images):
+    masks = images.parent / "masks"
+    options = replace(REFRACTIVE, features=FeatureOptions(mask_dir=masks))
+    before = keys_of(images, options=options)
+    assert again(keys_of(images), before) == ALL
+    for change in (
+        lambda: touched(masks / "left" / f"{NAMES[0]}.png"),
+        lambda: touched(masks / "left" / f"{NAMES[1]}.png", 9),
+        lambda: (masks / "left" / f"{NAMES[2]}.png").write_bytes(b"mask"),
+        lambda: (masks / "left" / f"{NAMES[0]}.png").unlink(),
+    ):
+        change()
+        after = keys_of(images, options=options)
+        assert again(before, after) == ALL
+        before = after
+    # What masks no image changes nothing.
+    (masks / "left" / "0099.png.png").write_bytes(b"mask")
+    assert again(before, keys_of(images, options=options)) == []
+
+
+OPTIONS = {
+    "contrast": ({"features": FeatureOptions(clahe=True)}, ALL),
+    "number of features": ({"features": FeatureOptions(max_num_features=999)}, ALL),
+    "threshold": ({"features": FeatureOptions(peak_threshold=0.01)}, ALL),
+    "pairs": ({"matching": MatchOptions(strategy="sequential")}, ALL[1:]),
+    "overlap": ({"matching": MatchOptions(overlap=3)}, ALL[1:]),
+    "matcher": ({"matching": MatchOptions(matcher="paper")}, ALL[1:]),
+    "seed": ({"seed": 1}, GEOMETRY),
+    "verification": ({"verification": VerificationOptions(max_error_px=3.0)}, GEOMETRY),
+    "mapping": ({"mapping": MappingOptions(max_error_px=5.0)}, ["mapping"]),
+    "angle": ({"mapping": MappingOptions(min_angle_deg=2.0)}, ["mapping"]),
+    "mapper": ({"mapper": "pinhole"}, ["mapping"]),
+    "threads": ({"num_threads": 1}, []),
+    "distance, by a baseline": ({"scene_distance_m": 7.0}, []),
+}
+
+
+@pytest.mark.parametrize("what", OPTIONS)
+def test_an_option_repeats_what_it_changes(images, what):
+    change, expected = OPTIONS[what]
+    after = keys_of(images, options=replace(REFRACTIVE, **change))
+    assert again(keys_of(images), after) == expected
+
+
+def test_the_papers_matcher_draws_lots_and_colmaps_does_not(images):
+    paper = replace(REFRACTIVE, matching=MatchOptions(matcher="paper"))
+    before = keys_of(images, options=paper)
+    assert again(before, keys_of(images, options=replace(paper, seed=1))) == ALL[1:]
+
+
+def with_camera(index, **more):
+    cameras = list(RIG.cameras)
+    cameras[index] = replace(cameras[index], **more)
+    return replace(RIG, cameras=tuple(cameras))
+
+
+def lens(index, **more):
+    old = RIG.cameras[index].camera
+    camera = pycolmap.Camera(
+        model=more.get("model", old.model_name),
+        width=more.get("width", old.width),
+        height=more.get("height", old.height),
+        params=more.get("params", old.params),
+    )
+    return with_camera(index, camera=camera)
+
+
+def params(slot, by):
+    found = np.array(RIG.cameras[1].camera.params)
+    found[slot] += by
+    return found
+
+
+def moved_rig(slot):
+    poses = RIG.cam_from_rig.copy()
+    poses[1, slot] += 1e-6
+    poses[1, :4] /= np.linalg.norm(poses[1, :4])
+    length = float(np.linalg.norm(poses[1, 4:]))
+    return replace(RIG, cam_from_rig=poses, baseline_m=length)
+
+
+def accuracy(**more):
+    return with_camera(1, accuracy=CameraAccuracy(**more))
+
+
+RIGS = {
+    "size": (lens(0, width=802), ALL),
+    "height": (lens(1, height=602), ALL),
+    "focal length": (lens(1, params=params(0, 1e-6)), GEOMETRY),
+    "last distortion": (lens(1, params=params(-1, 1e-9)), GEOMETRY),
+    "port": (with_camera(1, port=FlatPort(distance=0.0201)), GEOMETRY),
+    "water": (
+        with_camera(0, port=replace(RIG.cameras[0].port, n_water=1.3401)),
+        GEOMETRY,
+    ),
+    "valid radius": (with_camera(1, valid_radius_px=300.0), GEOMETRY),
+    "position": (moved_rig(4), GEOMETRY),
+    "rotation": (moved_rig(0), GEOMETRY),
+    "held normal": (with_camera(0, refine_normal=False), ["mapping"]),
+    "held distance": (with_camera(1, refine_distance=False), ["mapping"]),
+    "held placement": (
+        replace(RIG, refine_cam_from_rig=not RIG.refine_cam_from_rig),
+        ["mapping"],
+    ),
+    "baseline's deviation": (replace(RIG, baseline_stddev_m=0.0123), ["mapping"]),
+    "accuracy of the last": (accuracy(glass_index=0.0123), ["mapping"]),
+    "accuracy of a lens": (accuracy(focal=0.0123), ["mapping"]),
+    "accuracy of a tilt": (accuracy(normal_deg=0.123), ["mapping"]),
+    "names": (with_camera(0, name="port"), None),
+}
+
+
+@pytest.mark.parametrize("what", RIGS)
+def test_a_number_of_the_rig_repeats_what_it_changes(images, what):
+    rig, expected = RIGS[what]
+    found = again(keys_of(images), keys_of(images, rig))
+    if expected is None:  # the accuracies are named by the cameras; no more is
+        assert found in ([], ["mapping"])
+    else:
+        assert found == expected
+
+
+def test_exchanged_folders_keep_their_features(images):
+    left, right = RIG.cameras
+    cameras = (replace(left, images="right"), replace(right, images="left"))
+    after = keys_of(images, replace(RIG, cameras=cameras))
+    assert again(keys_of(images), after) == GEOMETRY
+
+
+def test_a_rig_from_its_baseline_is_a_step_of_its_own(images):
+    open_rig = replace(RIG, cam_from_rig=None)
+    before = keys_of(images, open_rig)
+    assert list(before) == [*FRONT, "rig", *GEOMETRY]
+    later = ["rig", *GEOMETRY]
+    for changed in (
+        replace(open_rig, baseline_m=0.2001),
+        replace(with_camera(0, port=FlatPort(distance=0.0201)), cam_from_rig=None),
+    ):
+        assert again(before, keys_of(images, changed)) == later
+    for change in (
+        {"mapping": MappingOptions(max_error_px=5.0)},
+        {"seed": 3},
+        {"verification": VerificationOptions(min_num_inliers=20)},
+    ):
+        options = replace(REFRACTIVE, **change)
+        assert again(before, keys_of(images, open_rig, options)) == later
+
+
+def test_one_camera_is_scaled_by_the_distance_that_is_given(images):
+    alone = replace(
+        RIG, cameras=RIG.cameras[:1], cam_from_rig=RIG.cam_from_rig[:1], baseline_m=None
+    )
+    before = keys_of(images, alone)
+    options = replace(REFRACTIVE, scene_distance_m=7.0)
+    assert again(before, keys_of(images, alone, options)) == GEOMETRY
+
+
+def test_a_long_survey_is_mapped_in_parts(images):
+    for k in range(4, 24):
+        for folder in ("left", "right"):
+            (images / folder / f"{k:04}.png").write_bytes(b"x")
+    options = replace(REFRACTIVE, mapping=MappingOptions(submap_frames=20))
+    before = keys_of(images, options=options)
+    assert list(before) == [*FRONT, "verification", "submaps", "mapping"]
+    larger = replace(REFRACTIVE, mapping=MappingOptions(submap_frames=21))
+    after = keys_of(images, options=larger)
+    assert again(before, after) == ["submaps", "mapping"]
+
+
+# ---- Fingerprints -------------------------------------------------------------------
+
+
+def test_no_number_of_an_array_is_left_out_of_a_fingerprint():
+    """As text, large arrays have only their first and last numbers."""
+    large = np.zeros((60, 60))
+    before = fingerprint([large])
+    for place in ((0, 0), (30, 30), (59, 59)):
+        other = large.copy()
+        other[place] = 1e-12
+        assert fingerprint([other]) != before
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert fingerprint([Path("a")]) != fingerprint([Path("b")])
+    assert fingerprint([np.int64(3)]) == fingerprint([3])
+    assert len(before) == 16
+    with pytest.raises(TypeError, match="no step may depend on object"):
+        fingerprint([object()])
+
+
+def test_every_file_of_a_model_is_in_its_mark(tmp_path):
+    sparse = tmp_path / "sparse"
+    sparse.mkdir()
+    names = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
+    for name in names:
+        (sparse / name).write_bytes(name.encode())
+    housing = tmp_path / "housing.yaml"
+    housing.write_text("version: 1")
+    before = model_fingerprint(sparse, housing)
+    assert model_fingerprint(sparse, housing) == before
+    for path in (*(sparse / name for name in names), housing):
+        content = path.read_bytes()
+        path.write_bytes(content[:-1] + b"?")
+        assert model_fingerprint(sparse, housing) != before
+        path.write_bytes(content)
+    (sparse / "rigs.bin").rename(sparse / "rigs.bin.old")
+    assert model_fingerprint(sparse, housing) != before
+    (sparse / "rigs.bin.old").rename(sparse / "rigs.bin")
+    (sparse / "more.bin").write_bytes(b"")
+    assert model_fingerprint(sparse, housing) != before
+    housing.unlink()
+    with pytest.raises(InputError, match="housing.yaml: cannot be read"):
+        model_fingerprint(sparse, housing)
+    with pytest.raises(InputError, match="nowhere: no such COLMAP model folder"):
+        model_fingerprint(tmp_path / "nowhere", housing)
+
+
+# ---- Depth maps ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model():
+    return small_model()
+
+
+@pytest.fixture
+def dense(model, tmp_path):
+    """A result with images; only names, sizes and times of these are read."""
+    images = tmp_path / "images"
+    for side in ("left", "right"):
+        (images / side).mkdir(parents=True)
+        for name in model.frame_names:
+            (images / side / name).write_bytes(b"x" * 7)
+            os.utime(images / side / name, ns=(10**18, 10**18))
+    return result_with(model, tmp_path)
+
+
+def result_with(model, folder):
+    calibration = result_of(model.scene)
+    return Result(
+        folder=folder,
+        model=model,
+        calibration=calibration,
+        solved=calibration,
+        summary={},
+        images=folder / "images",
+        fingerprint="mark",
+    )
+
+
+def depth_keys(result):
+    maps = DepthMaps(result, result.images)
+    assert [view.frame for view in maps.views] == [0, 1, 2]
+    return [maps._key(view) for view in maps.views]
+
+
+def changed(before, result):
+    """Frames whose depth map is made again."""
+    after = depth_keys(result)
+    return [k for k in range(3) if before[k] != after[k]]
+
+
+def with_scene(result, **more):
+    scene = replace(result.model.scene, **more)
+    return replace(result, model=replace(result.model, scene=scene))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_depth_map_is_of_its_two_images(dense, side):
+    before = depth_keys(dense)
+    assert changed(before, dense) == []
+    path = dense.images / side / "0001.jpg"
+    os.utime(path, ns=(10**18, 10**18 + 1))
+    assert changed(before, dense) == [1]
+    path.write_bytes(b"x" * 8)
+    os.utime(path, ns=(10**18, 10**18))
+    assert changed(before, dense) == [1]
+
+
+def test_a_depth_map_is_of_its_calibration(dense):
+    """Of lens, port and placement, and of no pose of the rig."""
+    before, scene = depth_keys(dense), dense.model.scene
+    for index in range(2):
+        camera = scene.cameras[index]
+        row = camera.lens.copy()
+        row[0] += 1e-9
+        port = replace(camera.port, distance=camera.port.distance + 1e-12)
+        for other in (camera.with_lens(row), camera.with_port(port)):
+            cameras = list(scene.cameras)
+            cameras[index] = other
+            assert changed(before, with_scene(dense, cameras=tuple(cameras))) == [0, 1, 2]
+    poses = scene.cam_from_rig.copy()
+    poses[1, 4] += 1e-12
+    assert changed(before, with_scene(dense, cam_from_rig=poses)) == [0, 1, 2]
+
+
+def test_a_depth_map_is_of_its_range(dense):
+    """Of the points of its frame; where these are few, of all, as in frame 0."""
+    scene = dense.model.scene
+    before = depth_keys(dense)
+    poses = scene.rig_from_world.copy()
+    poses[2, 6] += 0.5  # frame 2 is half a metre farther from all it sees
+    assert changed(before, with_scene(dense, rig_from_world=poses)) == [0, 2]
+
+
+def test_a_depth_map_that_is_old_or_missing_is_told(dense):
+    maps = DepthMaps(dense, dense.images)
+    view = maps.views[1]
+    path = dense.folder / "uwsfm-work" / "dense" / "000001_0-1.npz"
+    path.parent.mkdir(parents=True)
+    depth = DepthMap(
+        ranges=np.full((2, 3), 1.5, np.float32),
+        sensitivity=np.full((2, 3), 0.25, np.float32),
+    )
+    write_depth_map(depth, path, maps._key(view))
+    found = maps.read(1)
+    assert found.ranges[0, 0] == 1.5 and found.sensitivity[1, 2] == 0.25
+    write_depth_map(depth, path, "another")
+    for index in (0, 1):
+        with pytest.raises(InputError, match=r"_0-1.npz is missing or old: run uwsfm"):
+            maps.read(index)
+
+
+def test_every_image_is_looked_for_before_the_first_is_matched(dense):
+    maps = DepthMaps(dense, dense.images)
+    maps.require_images()
+    (dense.images / "right" / "0002.jpg").unlink()
+    with pytest.raises(InputError, match="0002.jpg"):
+        maps.require_images()
+
+
+def test_every_pair_has_what_its_calibration_adds(dense):
+    maps = DepthMaps(dense, dense.images)
+    maps.prepare_errors()
+    assert list(maps.errors) == [(0, 1)] and maps.errors[0, 1] is not None
+    open_one = replace(dense.calibration.covariance, determined=False)
+    calibration = replace(dense.calibration, covariance=open_one)
+    unknown = DepthMaps(replace(dense, calibration=calibration), dense.images)
+    unknown.prepare_errors()
+    assert unknown.errors == {(0, 1): None}
