@@ -251,6 +251,12 @@ def test_a_number_of_the_rig_repeats_what_it_changes(images, what):
         assert found == expected
 
 
+def test_another_accuracy_is_no_less_another_for_having_been_given_before(images):
+    """The covariance of all given numbers is a matrix of thousands."""
+    before = keys_of(images, accuracy(focal=0.0123))
+    assert again(before, keys_of(images, accuracy(focal=0.0124))) == ["mapping"]
+
+
 def test_exchanged_folders_keep_their_features(images):
     left, right = RIG.cameras
     cameras = (replace(left, images="right"), replace(right, images="left"))

@@ -44,7 +44,11 @@ _TABLES = ("test_printed_tables.py",)
 _SUMMARY = ("test_summary_numbers.py",)
 _REPORT = ("test_report_words.py", "test_report_numbers.py")
 _MEASURED = ("test_measure_table.py",)
-_LENGTHS = ("test_known_lengths.py", "test_lengths_file.py", "test_length_verdicts.py")
+_LENGTHS = (
+    *("test_known_lengths.py", "test_length_verdicts.py"),
+    "test_lengths_file.py::test_wrong_positions_end_inone_sentence",
+    "test_lengths_file.py::test_wrong_lengths_end_inone_sentence",
+)
 _STEPS = ("test_sfm_steps.py", "test_stale_work.py")
 _PIPE = "test_verdict_shown.py::test_a_pipe_is_wide_enough_and_a_terminal_as_wide_as_it_is"
 

@@ -1,0 +1,586 @@
+"""Lengths and positions that were given: where they go, and what is said of them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from hand_made import numbers
+from hand_made_result import bars, positions, result_of, small_model
+
+from uwsfm.calibration.length_verdicts import (
+    length_verdicts,
+    scale_verdict,
+    small_unit,
+)
+from uwsfm.calibration.lengths import Distances, Lengths, Positions
+from uwsfm.errors import InputError
+from uwsfm.geometry import rigid3
+from uwsfm.known_lengths import KnownLengths, image_index
+from uwsfm.lengths_file import load_lengths, load_positions
+
+
+@pytest.fixture(scope="module")
+def model():
+    return small_model()
+
+
+@pytest.fixture(scope="module")
+def result(model):
+    return result_of(model.scene)
+
+
+# ---- Words --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stddev", "word"),
+    [
+        (None, "arbitrary"),
+        (0.045, "determined"),
+        (0.055, "weakly determined"),
+        (0.9, "weakly determined"),
+        (1.1, "not determined"),
+        (math.nan, "not determined"),
+        (math.inf, "not determined"),
+    ],
+)
+def test_a_scale_is_determined_below_five_per_cent(stddev, word):
+    assert scale_verdict(stddev) == word
+    assert scale_verdict(0.05) == "weakly determined"
+    assert scale_verdict(1.0) == "not determined"
+
+
+def test_a_thousandth_of_an_arbitrary_length_is_no_millimetre():
+    assert small_unit(None) == "1e-3, scale arbitrary"
+    assert small_unit(0.9) == small_unit(0.01) == "mm"
+
+
+def scaled(result, own, in_all, **more):
+    covariance = result.covariance
+    in_all = replace(covariance.in_all, scale_stddev=in_all)
+    covariance = replace(covariance, scale_stddev=own, in_all=in_all)
+    return replace(result, covariance=covariance, **more)
+
+
+def test_an_open_or_weak_scale_is_a_sentence(result):
+    assert length_verdicts(scaled(result, 0.01, 0.02)) == ()
+    (weak,) = length_verdicts(scaled(result, 0.01, 0.123))
+    assert "scale is weakly determined, with a standard deviation of 12 % that" in weak
+    (arbitrary,) = length_verdicts(scaled(result, None, None))
+    assert arbitrary.startswith("scale arbitrary: nothing determines it")
+
+
+def test_one_camera_without_a_length_has_its_scale_from_refraction(result):
+    scene = result.scene
+    alone = replace(scene, cameras=scene.cameras[:1], cam_from_rig=scene.cam_from_rig[:1])
+    one = replace(result, scene=alone)
+    (sentence,) = length_verdicts(scaled(one, 0.01, 0.02))
+    assert sentence.startswith("the scale comes from refraction alone")
+    assert length_verdicts(scaled(one, 0.01, 0.02, lengths=replaced(bars(), [0, 0]))) == ()
+    assert "refraction" not in " ".join(length_verdicts(scaled(one, None, None)))
+
+
+def replaced(fit, misses):
+    """Known lengths that came out off by so many of their deviations."""
+    return replace(fit, found_m=fit.given_m + np.array(misses) * fit.stddevs_m)
+
+
+@pytest.mark.parametrize(("miss", "told"), [(3.6, False), (4.4, True), (-4.4, True)])
+def test_a_length_that_is_off_by_four_deviations_contradicts(result, miss, told):
+    sentences = length_verdicts(replace(result, lengths=replaced(bars(), [0.0, miss])))
+    assert len(sentences) == told
+    if told:
+        (sentence,) = sentences
+        found = 2.314 + miss * 0.001
+        assert sentence.startswith(
+            f"known length 2 came out as {found:.4g} m, given as 2.314 ± 0.001 m: it"
+        )
+
+
+def placed_fit(count, wrong, **more):
+    """So many positions, the first of them left out."""
+    inliers = np.arange(count) >= wrong
+    return replace(
+        positions(),
+        frame_idx=np.arange(count),
+        misses_m=np.tile([0.03, 0.04, 0.0], (count, 1)),
+        inliers=inliers,
+        scatter=more.pop("scatter", 1.0),
+        **more,
+    )
+
+
+def sentences_of(result, fit):
+    return length_verdicts(replace(result, positions=fit))
+
+
+def test_positions_that_were_left_out_are_counted(result):
+    assert sentences_of(result, placed_fit(20, 0)) == ()
+    (few,) = sentences_of(result, placed_fit(20, 7))
+    assert few == "7 of 20 positions contradict the images and were left out"
+    # More than two in five, there is something wrong with all of them.
+    (many,) = sentences_of(result, placed_fit(20, 9))
+    assert "9 of 20 positions" in many and "out: check the lever arm and its" in many
+    assert sentences_of(result, placed_fit(20, 8)) == (few.replace("7", "8"),)
+    (mirrored,) = sentences_of(result, placed_fit(9, 1))
+    assert "; with so few, mirrored axes" in mirrored and "check the lever" in mirrored
+    (enough,) = sentences_of(result, placed_fit(10, 1))
+    assert "mirrored" not in enough
+
+
+def test_positions_that_scatter_twice_as_much_are_told_with_what_they_miss_by(result):
+    """3 and 4 cm: 50 mm; the one that was left out by metres does not count."""
+    fit = placed_fit(20, 1, scatter=2.2)
+    misses = fit.misses_m.copy()
+    misses[0] = 99.0
+    _, sentence = sentences_of(result, replace(fit, misses_m=misses))
+    assert "the positions miss the model by 0.05 m, 2.2 times their" in sentence
+    assert sentences_of(result, placed_fit(20, 0, scatter=1.8)) == ()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "word"),
+    [
+        (1.8, None),
+        (2.2, "weakly determined"),
+        (18.0, "weakly determined"),
+        (22.0, "not determined"),
+    ],
+)
+def test_a_turn_of_the_model_is_told_with_its_axis(result, degrees, word):
+    axis = np.array([0.0, 0.6, 0.8])
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = math.radians(degrees) ** 2 * np.outer(axis, axis)
+    covariance[3:, 3:] = 9.0 * np.eye(3)
+    fit = placed_fit(20, 0, covariance=covariance)
+    turn, found = fit.turn
+    assert turn == pytest.approx(math.radians(degrees))
+    assert abs(found @ axis) == pytest.approx(1.0)
+    sentences = sentences_of(result, fit)
+    assert len(sentences) == (word is not None)
+    if word:
+        (sentence,) = sentences
+        assert f"is {word} (standard deviation {degrees:.0f} deg)" in sentence
+        x, y, z = numbers(sentence)[:3]
+        assert (x, abs(y), abs(z)) == (0.0, 0.6, 0.8) and y * z > 0.0
+
+
+# ---- Arrays -------------------------------------------------------------------------
+
+
+def test_distances_are_checked():
+    found = Distances.from_arrays([[0, 3], [2, 1]], [0.5, 0.7], [0.01, 0.02])
+    assert found.ends.tolist() == [[0, 3], [2, 1]]
+    assert found.lengths_m.tolist() == [0.5, 0.7]
+    assert found.stddevs_m.tolist() == [0.01, 0.02]
+    for ends, lengths, stddevs, words in (
+        ([0, 1], [0.5], [0.1], r"ends must be integers \(M, 2\)"),
+        ([[0, 1, 2]], [0.5], [0.1], r"ends must be integers \(M, 2\)"),
+        ([[0.0, 1.0]], [0.5], [0.1], r"ends must be integers \(M, 2\)"),
+        ([[0, 1]], [0.5, 0.6], [0.1], "lengths_m must have one entry"),
+        ([[0, 1]], [0.5], [0.1, 0.2], "stddevs_m must have one entry"),
+        ([[0, 1], [1, 2]], [0.5, 0.0], [0.1, 0.1], r"lengths_m\[1\] must be positive"),
+        ([[0, 1], [1, 2]], [0.5, 1.0], [-1.0, 0.1], r"stddevs_m\[0\] must be positive"),
+        ([[0, 1]], [math.inf], [0.1], r"lengths_m\[0\] must be positive and finite"),
+        ([[0, 1], [2, 2]], [0.5, 1.0], [0.1, 0.1], r"ends\[1\] are one and the same"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Distances.from_arrays(ends, lengths, stddevs)
+
+
+def test_positions_are_checked():
+    places = [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+    found = Positions.from_arrays([4, 2], places, [0.1, 0.2, 0.3], [1, 2, 3], "nav.csv")
+    assert found.frame_idx.tolist() == [4, 2] and found.positions.tolist() == places
+    # One deviation for all: x, y and z as they were given.
+    for block in found.covariances:
+        np.testing.assert_allclose(block, np.diag([0.01, 0.04, 0.09]))
+    assert found.lever_arm.tolist() == [1.0, 2.0, 3.0] and found.source == "nav.csv"
+    rows = Positions.from_arrays([4, 2], places, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    np.testing.assert_allclose(rows.covariances[1], np.diag([0.16, 0.25, 0.36]))
+    full = np.array([[2.0, 0.5, 0.0], [0.5, 3.0, 0.0], [0.0, 0.0, 4.0]])
+    both = Positions.from_arrays([4, 2], places, np.stack([full, 2 * full]))
+    np.testing.assert_array_equal(both.covariances[1], 2 * full)
+    assert rows.lever_arm.tolist() == [0.0, 0.0, 0.0]
+    skewed, flat = full.copy(), full.copy()
+    skewed[0, 1], flat[2, 2] = 0.6, 0.0
+    for frames, where, spread, arm, words in (
+        ([[4, 2]], places, 0.1, (0, 0, 0), "frame_idx must be integers"),
+        ([4.0, 2.0], places, 0.1, (0, 0, 0), "frame_idx must be integers"),
+        ([4], places, 0.1, (0, 0, 0), r"expected \(1, 3\)"),
+        ([4, 2], places, np.ones((1, 3, 3)), (0, 0, 0), r"expected \(M, 3, 3\)"),
+        ([4, 2], places, 0.1, (0, 0), "lever_arm must be three numbers"),
+        ([4, 2], places, 0.1, (0, 0, math.nan), "lever_arm must be three numbers"),
+        ([4, 2], [places[0], [0, math.nan, 0]], 0.1, (0, 0, 0), r"positions\[1\] is not"),
+        ([4, 2], places, np.stack([full, skewed]), (0, 0, 0), r"covariances\[1\] is not"),
+        ([4, 2], places, np.stack([flat, full]), (0, 0, 0), r"covariances\[0\] is not"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Positions.from_arrays(frames, where, spread, arm)
+
+
+def known():
+    return Lengths(
+        between_points=Distances.from_arrays([[10, 14], [12, 10]], [0.5, 0.7], [0.1, 0.2]),
+        between_frames=Distances.from_arrays([[0, 4], [4, 6]], [1.5, 1.7], [0.3, 0.4]),
+        positions=Positions.from_arrays(
+            [6, 2, 0], np.arange(9.0).reshape(3, 3), [0.1, 0.2, 0.3]
+        ),
+        clicked=np.array([20, 22, 25]),
+    )
+
+
+def test_lengths_of_a_part_are_numbered_as_it_is():
+    """Points 10, 12, 14 are its first, third and last; observations 21 and 24 go."""
+    keep = np.ones(26, dtype=bool)
+    keep[[3, 21, 24]] = False
+    found = known().in_part(keep, np.array([10, 11, 12, 14]))
+    assert found.between_points.ends.tolist() == [[0, 3], [2, 0]]
+    assert found.clicked.tolist() == [19, 20, 22]
+    assert found.between_frames is not None and found.positions is not None
+    with pytest.raises(InputError, match="scale bar 2: an end is not seen well enough"):
+        known().in_part(keep, np.array([10, 14]))
+    nothing = Lengths().in_part(keep, np.array([1]))
+    assert nothing.between_points is None and nothing.clicked.size == 0
+
+
+def test_lengths_of_some_frames_are_those_that_speak_of_them():
+    found = known().in_frames(np.array([0, 2, 4]))
+    assert found.between_frames.ends.tolist() == [[0, 2]]
+    assert found.between_frames.lengths_m.tolist() == [1.5]
+    assert found.between_frames.stddevs_m.tolist() == [0.3]
+    assert found.positions.frame_idx.tolist() == [1, 0]
+    assert found.positions.positions.tolist() == [[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]
+    assert len(found.positions.covariances) == 2
+    assert found.between_points is not None
+    assert Lengths().in_frames(np.array([0])).positions is None
+
+
+def test_indices_out_of_range_are_named(model):
+    scene = model.scene
+    ends = [[0, scene.num_points - 1]]
+    fine = Lengths(between_points=Distances.from_arrays(ends, [1.0], [0.1]))
+    assert fine.checked(scene) is fine
+    count = scene.num_points
+    places = np.zeros((1, 3))
+    for lengths, words in (
+        (
+            Lengths(between_points=Distances.from_arrays([[0, count]], [1.0], [0.1])),
+            f"between_points.ends is out of range: there are {count}",
+        ),
+        (
+            Lengths(between_points=Distances.from_arrays([[-1, 0]], [1.0], [0.1])),
+            "between_points.ends is out of range",
+        ),
+        (
+            Lengths(between_frames=Distances.from_arrays([[0, 3]], [1.0], [0.1])),
+            "between_frames.ends is out of range: there are 3",
+        ),
+        (
+            Lengths(positions=Positions.from_arrays([3], places, 0.1)),
+            "positions.frame_idx is out of range: there are 3",
+        ),
+        (
+            Lengths(clicked=np.array([scene.num_observations])),
+            f"clicked is out of range: there are {scene.num_observations}",
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            lengths.checked(scene)
+
+
+def test_lengths_give_the_scale_and_clicks_alone_do_not():
+    one = known()
+    for name in ("between_points", "between_frames", "positions"):
+        assert Lengths(**{name: getattr(one, name)}).give_scale
+    assert not Lengths(clicked=np.array([1])).give_scale
+
+
+def test_a_fit_of_some_frames_is_numbered_as_they_are():
+    found = positions().in_frames(np.array([1, 3]))
+    assert found.frame_idx.tolist() == [0, 1]
+    assert found.misses_m.tolist() == [[0.0, 0.04, 0.0], [0.0, 0.0, 0.12]]
+    assert found.inliers.tolist() == [True, True] and found.num_outliers == 0
+    assert positions().num_outliers == 1
+
+
+# ---- By the names of images ---------------------------------------------------------
+
+
+def lengths_file(folder, **content):
+    path = folder / "lengths.yaml"
+    path.write_text(yaml.safe_dump({"version": 1, **content}))
+    return path
+
+
+def end(*clicks):
+    return [{"image": name, "xy": list(xy)} for name, xy in clicks]
+
+
+BARS = [
+    {
+        "length_m": 0.51,
+        "stddev_m": 0.0011,
+        "click_stddev_px": 2.5,
+        "ends": [
+            end(("left/0000.jpg", (1.0, 2.0)), ("right/0001.jpg", (3.0, 4.0))),
+            end(("left/0002.jpg", (5.0, 6.0)), ("left/0001.jpg", (7.0, 8.0))),
+        ],
+    },
+    {
+        "length_m": 0.62,
+        "stddev_m": 0.0022,
+        "ends": [
+            end(("right/0002.jpg", (9.0, 10.0)), ("right/0000.jpg", (11.0, 12.0))),
+            end(("left/0000.jpg", (13.0, 14.0)), ("right/0000.jpg", (15.0, 16.0))),
+        ],
+    },
+]
+
+
+def test_ends_of_bars_are_points_of_their_own_at_the_end(model, tmp_path):
+    given = KnownLengths.read(lengths_file(tmp_path, scale_bars=BARS), None, None)
+    given.check_names(model.rig, model.frame_names)
+    scene, lengths = given.placed(model.rig, model.frame_names, model.scene)
+    before = model.scene
+    points, observations = before.num_points, before.num_observations
+    assert scene.num_points == points + 4
+    assert np.all(np.isnan(scene.points[points:]))
+    np.testing.assert_array_equal(scene.points[:points], before.points)
+    np.testing.assert_array_equal(scene.xy[:observations], before.xy)
+    new = slice(observations, None)
+    assert scene.xy[new].ravel().tolist() == list(range(1, 17))
+    assert scene.camera_idx[new].tolist() == [0, 1, 0, 0, 1, 1, 0, 1]
+    assert scene.frame_idx[new].tolist() == [0, 1, 2, 1, 2, 0, 0, 0]
+    expected = points + np.array([0, 0, 1, 1, 2, 2, 3, 3])
+    assert scene.point_idx[new].tolist() == expected.tolist()
+    known = lengths.between_points
+    assert known.ends.tolist() == [[points, points + 1], [points + 2, points + 3]]
+    assert known.lengths_m.tolist() == [0.51, 0.62]
+    assert known.stddevs_m.tolist() == [0.0011, 0.0022]
+    assert lengths.click_stddevs_px.tolist() == [2.5, 1.0]
+    assert lengths.clicked.tolist() == list(range(observations, observations + 8))
+
+
+def test_distances_and_positions_go_to_the_frames_of_their_names(model, tmp_path):
+    centers = rigid3.inverse(model.scene.rig_from_world)[:, 4:]
+    true = float(np.linalg.norm(centers[2] - centers[0]))
+    path = lengths_file(
+        tmp_path,
+        frame_distances=[
+            {"frames": ["0002.jpg", "0000.jpg"], "length_m": true, "stddev_m": 0.03}
+        ],
+    )
+    nav = tmp_path / "nav.csv"
+    nav.write_text(
+        "frame,x,y,z,sx,sy,sz\n"
+        "0002.jpg,1,2,3,0.1,0.2,0.3\n"
+        "0000.jpg,4,5,6,0.4,0.5,0.6\n"
+        "0001.jpg,7,8,9,0.7,0.8,0.9\n"
+    )
+    given = KnownLengths.read(path, nav, [0.1, -0.2, 0.3])
+    assert given.given and not KnownLengths.read(None, None, None).given
+    scene, lengths = given.placed(model.rig, model.frame_names, model.scene)
+    assert scene is model.scene
+    between = lengths.between_frames
+    assert between.ends.tolist() == [[2, 0]]
+    assert between.lengths_m.tolist() == [true]
+    assert between.stddevs_m.tolist() == [0.03]
+    known = lengths.positions
+    assert known.frame_idx.tolist() == [2, 0, 1]
+    assert known.positions.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    deviations = [np.sqrt(np.diag(block)).tolist() for block in known.covariances]
+    np.testing.assert_allclose(
+        deviations, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]]
+    )
+    assert known.lever_arm.tolist() == [0.1, -0.2, 0.3] and known.source == str(nav)
+    nothing = KnownLengths.read(None, None, None)
+    assert nothing.placed(model.rig, model.frame_names, scene) == (scene, None)
+    two = ("0002.jpg", "else.jpg", "0001.jpg")
+    with pytest.raises(InputError, match="2 positions belong to frames of the model"):
+        replace(given, file=None).placed(model.rig, two, scene)
+    with pytest.raises(InputError, match=r"frame_distances\[0\]: frame '0000.jpg' is not"):
+        replace(given, table=None).placed(model.rig, two, scene)
+
+
+@pytest.mark.parametrize(
+    ("factor", "refused"), [(4.5, False), (5.5, True), (1 / 4.5, False), (1 / 5.5, True)]
+)
+def test_a_distance_is_in_another_unit_beyond_five_times(
+    model, tmp_path, factor, refused
+):
+    centers = rigid3.inverse(model.scene.rig_from_world)[:, 4:]
+    true = float(np.linalg.norm(centers[1] - centers[0]))
+    item = {"frames": ["0000.jpg", "0001.jpg"], "stddev_m": 0.1}
+    item["length_m"] = factor * true
+    given = KnownLengths.read(lengths_file(tmp_path, frame_distances=[item]), None, None)
+    if refused:
+        with pytest.raises(InputError, match=f"these frames are {true:.3g} m apart"):
+            given.placed(model.rig, model.frame_names, model.scene)
+        # Without a baseline there is no metre to compare with.
+        alone = replace(
+            model.rig,
+            cameras=model.rig.cameras[:1],
+            cam_from_rig=model.rig.cam_from_rig[:1],
+            baseline_m=None,
+        )
+        given.placed(alone, model.frame_names, model.scene)
+    else:
+        given.placed(model.rig, model.frame_names, model.scene)
+
+
+def test_names_and_pixels_that_no_image_has_are_named(model, tmp_path):
+    def check(**content):
+        given = KnownLengths.read(lengths_file(tmp_path, **content), None, None)
+        given.check_names(model.rig, model.frame_names)
+
+    far = [{"frames": ["0000.jpg", "9.jpg"], "length_m": 1.0, "stddev_m": 0.1}]
+    with pytest.raises(InputError, match=r"frame_distances\[0\].frames: '9.jpg' is not"):
+        check(frame_distances=far)
+    for click, words in (
+        (("up/0000.jpg", (1.0, 2.0)), "'up/0000.jpg' is not among the images, whose"),
+        (("right/0000.jpg", (800.5, 2.0)), r"xy \(800.5, 2\) is outside of right/0000"),
+        (("right/0000.jpg", (1.0, 600.5)), "which has 800x600 pixels"),
+        (("right/0000.jpg", (-0.5, 2.0)), r"xy \(-0.5, 2\) is outside"),
+        (("right/0000.jpg", (1.0, -0.5)), r"xy \(1, -0.5\) is outside"),
+    ):
+        bar = {**BARS[1], "ends": [BARS[1]["ends"][0], end(BARS_FIRST, click)]}
+        with pytest.raises(InputError, match=words) as error:
+            check(scale_bars=[BARS[0], bar])
+        assert "scale_bars[1].ends[1]" in str(error.value)
+    # The corners of the image are in it.
+    corner = end(("left/0000.jpg", (0.0, 0.0)), ("right/0000.jpg", (800.0, 600.0)))
+    check(scale_bars=[{**BARS[1], "ends": [corner, corner]}])
+    once = end(("left/0000.jpg", (1.0, 2.0)), ("left/0000.jpg", (3.0, 4.0)))
+    bar = {**BARS[1], "ends": [BARS[1]["ends"][0], once]}
+    given = KnownLengths.read(lengths_file(tmp_path, scale_bars=[bar]), None, None)
+    with pytest.raises(InputError, match=r"ends\[1\]: it takes two different .* are 1"):
+        given.placed(model.rig, model.frame_names, model.scene)
+    nav = tmp_path / "nav.csv"
+    rows = "".join(f"{name},{k},2,3,1,1,1\n" for k, name in enumerate("abc"))
+    nav.write_text("frame,x,y,z,sx,sy,sz\n" + rows)
+    table = KnownLengths.read(None, nav, None)
+    with pytest.raises(InputError, match=r"frame 'a' is not .* \(nor are 2 more\)"):
+        table.check_names(model.rig, model.frame_names)
+    table.check_names(model.rig, tuple("abc"))
+
+
+BARS_FIRST = ("left/0000.jpg", (1.0, 2.0))
+
+
+def test_images_are_named_by_folder_and_frame(model):
+    assert image_index(model.rig, ("a.png", "b.png")) == {
+        "left/a.png": (0, 0),
+        "left/b.png": (0, 1),
+        "right/a.png": (1, 0),
+        "right/b.png": (1, 1),
+    }
+
+
+@pytest.mark.parametrize(
+    ("arm", "words"),
+    [
+        ([1.0, 2.0], "must be three numbers"),
+        ([1.0, math.inf, 2.0], "must be three numbers"),
+        ([1.0, 2.0, -33.0], "the antenna is not 33 m away"),
+        ([1.0, 2.0, -27.0], None),
+    ],
+)
+def test_a_lever_arm_is_three_numbers_of_some_metres(tmp_path, arm, words):
+    nav = tmp_path / "nav.csv"
+    rows = "".join(f"{k},{k},2,3,1,1,1\n" for k in range(3))
+    nav.write_text("frame,x,y,z,sx,sy,sz\n" + rows)
+    if words is None:
+        assert KnownLengths.read(None, nav, arm).lever_arm.tolist() == arm
+        with pytest.raises(InputError, match="has no effect without positions"):
+            KnownLengths.read(None, None, arm)
+    else:
+        with pytest.raises(InputError, match=words):
+            KnownLengths.read(None, nav, arm)
+
+
+# ---- Files --------------------------------------------------------------------------
+
+
+def test_a_file_of_lengths_is_read_with_its_defaults(tmp_path):
+    found = load_lengths(lengths_file(tmp_path, scale_bars=BARS))
+    first, second = found.scale_bars
+    assert (first.length_m, first.stddev_m, first.click_stddev_px) == (0.51, 0.0011, 2.5)
+    assert second.click_stddev_px == 1.0 and found.frame_distances == ()
+    assert first.ends[1][0].image == "left/0002.jpg" and first.ends[1][0].xy == (5, 6)
+    for content, words in (
+        ({"scale_bars": []}, "neither scale_bars nor frame_distances are in it"),
+        (
+            {"frame_distances": [{"frames": ["a", "a"], "length_m": 1, "stddev_m": 1}]},
+            r"frame_distances\[0\].frames: one and the same frame",
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_lengths(lengths_file(tmp_path, **content))
+
+
+def nav(folder, rows, header="frame,x,y,z,sx,sy,sz"):
+    path = folder / "nav.csv"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_a_table_of_positions_is_read_column_by_column(tmp_path):
+    rows = ["a,1,2,3,0.1,0.2,0.3", "", " b ,4,5,6,0.4,0.5,0.6", "c,7,8,9,0.7,0.8,0.9"]
+    found = load_positions(nav(tmp_path, rows))
+    assert found.frames == ("a", "b", "c")
+    assert found.positions.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    assert found.stddevs.tolist() == [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (["a,1,2,3,1,1,1", "b,1,2,4,1,1,1"], "2 positions are too few"),
+        (["a,1,2,3,1,1,1", "a,1,2,3,1,1,1"], "row 3: frame 'a' is given twice"),
+        (["a,1,2,3,1,1"], "row 2: 6 columns instead of 7"),
+        (["a,1,2,x,1,1,1"], "row 2: z: 'x' is not a number"),
+        (["a,1,nan,3,1,1,1"], "row 2: y: nan is not finite"),
+        (["a,1,2,3,1,0,1"], "row 2: sy: 0 m must be positive"),
+        (["a,1,2,3,1,1,1100000"], r"row 2: sz: 1.1e\+06 m must be positive, and at"),
+    ],
+)
+def test_wrong_rows_are_named_with_their_column(tmp_path, rows, words):
+    with pytest.raises(InputError, match=words):
+        load_positions(nav(tmp_path, rows))
+
+
+@pytest.mark.parametrize(
+    ("step", "at", "height", "words"),
+    [
+        # Two centimetres in x and y, where degrees may be.
+        (0.009, (12.3, 51.5), 5.0, "x and y change by 18 mm only over 3 positions"),
+        (0.011, (12.3, 51.5), 5.0, None),
+        (0.009, (0.3, 0.5), 5.0, None),
+        (0.009, (380.0, 0.5), 5.0, None),
+        (0.009, (12.3, 0.5), 5.0, "if 12.3090 and 0.5000 are degrees of longitude"),
+        (0.009, (0.3, 0.5), 0.009, "lie within 20 mm of each other"),
+        (0.011, (0.3, 0.5), 0.009, None),
+        (9.0, (11000.0, 0.5), 5.0, "coordinates up to 11018 m are not of a local"),
+        (9.0, (9900.0, 0.5), 5.0, None),
+    ],
+)
+def test_degrees_and_millimetres_are_no_positions(tmp_path, step, at, height, words):
+    rows = [f"{k},{at[0] + k * step},{at[1]},{k * height},1,1,1" for k in range(3)]
+    path = nav(tmp_path, rows)
+    if words is None:
+        assert len(load_positions(path).frames) == 3
+    else:
+        with pytest.raises(InputError, match=words):
+            load_positions(path)
+
+
+def test_another_header_is_refused_with_the_right_one(tmp_path):
+    with pytest.raises(InputError, match="the column 'lat' is in degrees"):
+        load_positions(nav(tmp_path, [], "frame,lat,lon,z,sx,sy,sz"))
+    with pytest.raises(InputError, match="must be frame,x,y,z,sx,sy,sz, got 'a,b'"):
+        load_positions(nav(tmp_path, [], "a,b"))
+    rows = [f"{k},{k},2,3,1,1,1" for k in range(3)]
+    assert len(load_positions(nav(tmp_path, rows, " Frame ,X,y,z,sx,sy,SZ")).frames) == 3
