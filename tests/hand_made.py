@@ -54,8 +54,8 @@ def slope(degrees: float) -> float:
 def flat_camera(name: str, start: float, **more: Any) -> dict[str, Any]:
     """The entry of a camera behind a flat port.
 
-    Tilts of ``start`` and ``-start - 1`` degrees, a port ``start`` centimetres away, and
-    deviations that are all other numbers.
+    Tilts of ``start`` and ``-start - 1`` degrees, a port ``start`` centimetres away,
+    and deviations that are all other numbers.
     """
     x, y = slope(start), slope(-start - 1.0)
     return {
@@ -181,7 +181,10 @@ def summary(**more: Any) -> dict[str, Any]:
         "timings_s": {"features": 30.04, "matching": 60.06, "adjusting": 10.02},
         "steps_of_earlier_runs": ["features"],
         "versions": {"uwsfm": "9.8.7"},
-        "solves": [_solve("cauchy", 70000, [9.0, 4.0]), _solve("l2", 61234, [3.0, 2.0])],
+        "solves": [
+            _solve("cauchy", 70000, [9.0, 4.0]),
+            _solve("l2", 61234, [3.0, 2.0]),
+        ],
         "solver_converged": True,
         **more,
     }

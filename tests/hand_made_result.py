@@ -69,7 +69,9 @@ def result_of(scene: Scene, **more) -> CalibrationResult:
         cameras=(camera_covariance(3.0), camera_covariance(5.0)),
         border=np.diag(variances) + 3e-8 * np.eye(6),
         given=np.zeros((count, count)),
-        frames=np.stack([f * np.diag([1, 2, 3, 4, 5, 6]) * 1e-8 for f in range(FRAMES)]),
+        frames=np.stack(
+            [f * np.diag([1, 2, 3, 4, 5, 6]) * 1e-8 for f in range(FRAMES)]
+        ),
         scale_stddev=0.021,
     )
     covariance = Covariance(

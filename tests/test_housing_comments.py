@@ -8,8 +8,8 @@ import pytest
 from hand_made_result import camera_covariance, result_of, small_model
 
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
-from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.named_covariance import NamedCovariance
+from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.rig_file import load_rig
 
@@ -158,7 +158,9 @@ def test_each_number_has_a_comment_if_it_was_refined(model, result, tmp_path):
         path = tmp_path / f"{k}.yaml"
         export_housing(replace(model.rig, cameras=cameras), path, result)
         begun = [comment.partition(":")[0] for comment in comments(path)]
-        found = tuple(begun.count(name) == 1 for name in ("normal", "distance", "center"))
+        found = tuple(
+            begun.count(name) == 1 for name in ("normal", "distance", "center")
+        )
         assert found == (tilt, distance, center)
 
 

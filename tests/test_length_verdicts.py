@@ -74,11 +74,15 @@ def test_an_open_or_weak_scale_is_a_sentence(result):
 
 def test_one_camera_without_a_length_has_its_scale_from_refraction(result):
     scene = result.scene
-    alone = replace(scene, cameras=scene.cameras[:1], cam_from_rig=scene.cam_from_rig[:1])
+    alone = replace(
+        scene, cameras=scene.cameras[:1], cam_from_rig=scene.cam_from_rig[:1]
+    )
     one = replace(result, scene=alone)
     (sentence,) = length_verdicts(scaled(one, 0.01, 0.02))
     assert sentence.startswith("the scale comes from refraction alone")
-    assert length_verdicts(scaled(one, 0.01, 0.02, lengths=replaced(bars(), [0, 0]))) == ()
+    assert (
+        length_verdicts(scaled(one, 0.01, 0.02, lengths=replaced(bars(), [0, 0]))) == ()
+    )
     assert "refraction" not in " ".join(length_verdicts(scaled(one, None, None)))
 
 
@@ -213,8 +217,20 @@ def test_positions_are_checked():
         ([4, 2], places, np.ones((1, 3, 3)), (0, 0, 0), r"expected \(M, 3, 3\)"),
         ([4, 2], places, 0.1, (0, 0), "lever_arm must be three numbers"),
         ([4, 2], places, 0.1, (0, 0, math.nan), "lever_arm must be three numbers"),
-        ([4, 2], [places[0], [0, math.nan, 0]], 0.1, (0, 0, 0), r"positions\[1\] is not"),
-        ([4, 2], places, np.stack([full, skewed]), (0, 0, 0), r"covariances\[1\] is not"),
+        (
+            [4, 2],
+            [places[0], [0, math.nan, 0]],
+            0.1,
+            (0, 0, 0),
+            r"positions\[1\] is not",
+        ),
+        (
+            [4, 2],
+            places,
+            np.stack([full, skewed]),
+            (0, 0, 0),
+            r"covariances\[1\] is not",
+        ),
         ([4, 2], places, np.stack([flat, full]), (0, 0, 0), r"covariances\[0\] is not"),
     ):
         with pytest.raises(InputError, match=words):
@@ -223,7 +239,9 @@ def test_positions_are_checked():
 
 def known():
     return Lengths(
-        between_points=Distances.from_arrays([[10, 14], [12, 10]], [0.5, 0.7], [0.1, 0.2]),
+        between_points=Distances.from_arrays(
+            [[10, 14], [12, 10]], [0.5, 0.7], [0.1, 0.2]
+        ),
         between_frames=Distances.from_arrays([[0, 4], [4, 6]], [1.5, 1.7], [0.3, 0.4]),
         positions=Positions.from_arrays(
             [6, 2, 0], np.arange(9.0).reshape(3, 3), [0.1, 0.2, 0.3]
@@ -401,12 +419,15 @@ def test_distances_and_positions_go_to_the_frames_of_their_names(model, tmp_path
     two = ("0002.jpg", "else.jpg", "0001.jpg")
     with pytest.raises(InputError, match="2 positions belong to frames of the model"):
         replace(given, file=None).placed(model.rig, two, scene)
-    with pytest.raises(InputError, match=r"frame_distances\[0\]: frame '0000.jpg' is not"):
+    with pytest.raises(
+        InputError, match=r"frame_distances\[0\]: frame '0000.jpg' is not"
+    ):
         replace(given, table=None).placed(model.rig, two, scene)
 
 
 @pytest.mark.parametrize(
-    ("factor", "refused"), [(4.5, False), (5.5, True), (1 / 4.5, False), (1 / 5.5, True)]
+    ("factor", "refused"),
+    [(4.5, False), (5.5, True), (1 / 4.5, False), (1 / 5.5, True)],
 )
 def test_a_distance_is_in_another_unit_beyond_five_times(
     model, tmp_path, factor, refused
@@ -415,7 +436,9 @@ def test_a_distance_is_in_another_unit_beyond_five_times(
     true = float(np.linalg.norm(centers[1] - centers[0]))
     item = {"frames": ["0000.jpg", "0001.jpg"], "stddev_m": 0.1}
     item["length_m"] = factor * true
-    given = KnownLengths.read(lengths_file(tmp_path, frame_distances=[item]), None, None)
+    given = KnownLengths.read(
+        lengths_file(tmp_path, frame_distances=[item]), None, None
+    )
     if refused:
         with pytest.raises(InputError, match=f"these frames are {true:.3g} m apart"):
             given.placed(model.rig, model.frame_names, model.scene)
@@ -437,7 +460,9 @@ def test_names_and_pixels_that_no_image_has_are_named(model, tmp_path):
         given.check_names(model.rig, model.frame_names)
 
     far = [{"frames": ["0000.jpg", "9.jpg"], "length_m": 1.0, "stddev_m": 0.1}]
-    with pytest.raises(InputError, match=r"frame_distances\[0\].frames: '9.jpg' is not"):
+    with pytest.raises(
+        InputError, match=r"frame_distances\[0\].frames: '9.jpg' is not"
+    ):
         check(frame_distances=far)
     for click, words in (
         (("up/0000.jpg", (1.0, 2.0)), "'up/0000.jpg' is not among the images, whose"),
@@ -507,7 +532,11 @@ def test_a_lever_arm_is_three_numbers_of_some_metres(tmp_path, arm, words):
 def test_a_file_of_lengths_is_read_with_its_defaults(tmp_path):
     found = load_lengths(lengths_file(tmp_path, scale_bars=BARS))
     first, second = found.scale_bars
-    assert (first.length_m, first.stddev_m, first.click_stddev_px) == (0.51, 0.0011, 2.5)
+    assert (first.length_m, first.stddev_m, first.click_stddev_px) == (
+        0.51,
+        0.0011,
+        2.5,
+    )
     assert second.click_stddev_px == 1.0 and found.frame_distances == ()
     assert first.ends[1][0].image == "left/0002.jpg" and first.ends[1][0].xy == (5, 6)
     for content, words in (
@@ -583,4 +612,6 @@ def test_another_header_is_refused_with_the_right_one(tmp_path):
     with pytest.raises(InputError, match="must be frame,x,y,z,sx,sy,sz, got 'a,b'"):
         load_positions(nav(tmp_path, [], "a,b"))
     rows = [f"{k},{k},2,3,1,1,1" for k in range(3)]
-    assert len(load_positions(nav(tmp_path, rows, " Frame ,X,y,z,sx,sy,SZ")).frames) == 3
+    assert (
+        len(load_positions(nav(tmp_path, rows, " Frame ,X,y,z,sx,sy,SZ")).frames) == 3
+    )

@@ -1,4 +1,4 @@
-"""What is measured, as numbers that are known by hand, in the units that are printed."""
+"""What is measured: numbers that are known by hand, in the units that are printed."""
 
 import math
 from dataclasses import replace
@@ -155,7 +155,10 @@ def test_remarks_have_their_units():
     """Corners 3, 4 and 0 mm off their plane: 2.9 mm RMS; a place 5 mm away."""
     flat = np.array([0.003, -0.004, 0.0])
     near = Spot(
-        WorldPick((0.1, 0.2, 0.3)), "nearest point of the model, 9; so", 3, moved_by=0.005
+        WorldPick((0.1, 0.2, 0.3)),
+        "nearest point of the model, 9; so",
+        3,
+        moved_by=0.005,
     )
     far = replace(near, how="nearest point of a cloud", moved_by=1.5)
     once = Spot(PointPick(3), "clicked in one image, at the depth of a cloud", 2)
@@ -386,7 +389,9 @@ def test_a_note_says_how_well_the_scale_is_known(result, stddev, words):
         assert length.notes[0] == "not determined by the images"
         assert length.stddev is length.stddev_alone is length.stddev_in_all is None
     assert found.unit == ("scale arbitrary" if stddev is None else "metre")
-    assert found.summary["measurements"][0]["unit"] == ("unit" if stddev is None else "m")
+    assert found.summary["measurements"][0]["unit"] == (
+        "unit" if stddev is None else "m"
+    )
 
 
 def test_the_words_of_a_doubtful_result_are_no_better(result):
@@ -509,7 +514,7 @@ def test_clicks_that_miss_each_other_are_named(result):
         moved[0]["xy"], moved[1]["xy"] = [x0, y0 + d / 2], [x1, y1 - d / 2]
         found = one(result, distances=[{"ends": [moved, 5]}])
         miss = found.spots[0].miss_px
-        # Epipolar lines are nearly rows here: the gap is d / sqrt(2), to a few per cent.
+        # Epipolar lines are nearly rows here: the gap is d / sqrt(2), nearly.
         assert miss == pytest.approx(d / math.sqrt(2.0), rel=0.1)
         noise = miss / 4.2
         noted = one(
@@ -521,9 +526,7 @@ def test_clicks_that_miss_each_other_are_named(result):
         ).spots[0]
         assert calm.note is None
         with pytest.raises(InputError, match="its clicks miss each other by"):
-            one(
-                result, click_stddev_px=miss / 300.0, distances=[{"ends": [moved, 5]}]
-            )
+            one(result, click_stddev_px=miss / 300.0, distances=[{"ends": [moved, 5]}])
 
 
 def test_points_and_places_of_the_model(result):
@@ -633,7 +636,9 @@ def test_a_place_is_the_clouds_up_to_five_spacings():
                 [0.0, 0.0, 1.0], abs=1e-9
             )
         else:
-            with pytest.raises(InputError, match="is 0.055 m away, the points there 0.01"):
+            with pytest.raises(
+                InputError, match="is 0.055 m away, the points there 0.01"
+            ):
                 surface.nearest(np.array([0.0, 0.0, 1.0 + away]))
 
 
@@ -641,7 +646,9 @@ def seen(result, points, stddev=1e-3):
     """A surface in front of the first left camera, as it sees it."""
     scene = result.model.scene
     world = rigid3.transform(rigid3.inverse(scene.rig_from_world[0]), points)
-    return SurfaceImage(Surface(world, "a cloud", np.full(len(points), stddev)), scene, 0, 0)
+    return SurfaceImage(
+        Surface(world, "a cloud", np.full(len(points), stddev)), scene, 0, 0
+    )
 
 
 @pytest.mark.parametrize(("step", "hidden"), [(0.045, False), (0.055, True)])
@@ -683,11 +690,17 @@ def test_a_place_is_seen_by_the_images_that_saw_the_points_around(result):
     model = Surface(scene.points, "the sparse model")
     camera, frame, xy = views_of(scene, model, scene.points[4])
     mine = scene.point_idx == 4
-    saw = set(zip(scene.camera_idx[mine].tolist(), scene.frame_idx[mine].tolist(), strict=True))
+    saw = set(
+        zip(
+            scene.camera_idx[mine].tolist(), scene.frame_idx[mine].tolist(), strict=True
+        )
+    )
     assert saw <= set(zip(camera.tolist(), frame.tolist(), strict=True))
     exact = scene.projections()[0][mine]
     for k in range(len(xy)):
-        rows = (scene.camera_idx[mine] == camera[k]) & (scene.frame_idx[mine] == frame[k])
+        rows = (scene.camera_idx[mine] == camera[k]) & (
+            scene.frame_idx[mine] == frame[k]
+        )
         if rows.any():
             np.testing.assert_allclose(xy[k], exact[rows][0], atol=1e-6)
     assert np.all((xy >= 0.0) & (xy <= [800.0, 600.0]))

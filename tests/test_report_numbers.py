@@ -15,11 +15,11 @@ from hand_made_result import FRAMES, result_of, small_model
 
 from uwsfm.export.files import depth_stddev
 from uwsfm.geometry import rigid3
-from uwsfm.report.gather import gather, numbers_of
+from uwsfm.report.gather import _coverage, gather, numbers_of
 from uwsfm.report.left_files import left_files
 from uwsfm.report.page import cost_unit, page_of, scales_of
 from uwsfm.report.tables import frame_stddevs, frames
-from uwsfm.report.view import level_axes, view_of
+from uwsfm.report.view import level_axes, strips, view_of
 from uwsfm.trust.residuals import CameraResiduals, Profile, Residuals
 
 
@@ -223,7 +223,9 @@ def test_time_is_that_of_this_run(page, tables):
 def test_what_the_page_says_in_sentences(page, report):
     text = text_of(page)
     assert "37 of 41 frames are registered" in text
-    assert "at the start and after each step of the 2 solves; the last has 61234" in text
+    assert (
+        "at the start and after each step of the 2 solves; the last has 61234" in text
+    )
     assert "Root of twice the cost per observation (px)" in text
     assert "Converged." in text and "Stopped before" not in text
     assert "Not registered: 0003.jpg, 0011.jpg, 0012.jpg, 0040.jpg." in text
@@ -312,8 +314,8 @@ def words_of(report, *cameras):
 def test_residuals_are_told_with_their_numbers(report):
     text = words_of(report, camera(), camera("right"))
     assert (
-        "The pinhole leaves 1.23 px RMS, of which 0.57 px is systematic by place in the "
-        "image and depth; uwsfm leaves 0.456 px RMS, of which 0.031 px." in text
+        "The pinhole leaves 1.23 px RMS, of which 0.57 px is systematic by place in "
+        "the image and depth; uwsfm leaves 0.456 px RMS, of which 0.031 px." in text
     )
     assert "same depth, is 0.031 px in left and right." in text
     assert "single centre" not in text and "Fitted in the same way" not in text
@@ -339,7 +341,9 @@ def test_whether_it_is_the_lens_is_told_by_what_a_free_lens_leaves(report):
     ):
         freed = residuals(0.321, systematic)
         text = words_of(
-            report, camera(freed=freed, least_central_px=(0.123, 0.987)), camera("right")
+            report,
+            camera(freed=freed, least_central_px=(0.123, 0.987)),
+            camera("right"),
         )
         assert "uwsfm's model leaves 0.321 px RMS, of which" in text and words in text
         assert "off by 0.12 px RMS and up to 0.99 px at the 10th" in text
@@ -355,6 +359,22 @@ def test_coverage_is_of_the_images_that_are_there(model, report):
         # `model_of` adds one keypoint that no point uses.
         assert found.features_per_image == np.median(per_image + 1)
         assert found.empty_share == 1.0  # fewer than 8 in every cell
+
+
+def test_coverage_counts_images_without_observations_and_nearly_empty_cells(model):
+    """Three images, whose last has lost its observations; cells of 7, 8 and 9."""
+    scene = model.scene
+    keep = (scene.camera_idx == 1) | (scene.frame_idx < 2)
+    rows = {
+        n: getattr(scene, n)[keep] for n in ("camera_idx", "frame_idx", "point_idx")
+    }
+    fewer = replace(model, scene=replace(scene, xy=scene.xy[keep], **rows))
+    counts = np.array([[7, 8, 9, 9]])
+    found = _coverage(fewer, 0, camera(counts=counts))
+    assert found.empty_share == 0.25 and found.num_images == 3
+    mine = np.bincount(scene.frame_idx[scene.camera_idx == 0], minlength=3)
+    mine[2] = 0
+    assert found.observations_per_image == np.median(mine)
 
 
 def test_the_numbers_of_the_page_are_beside_it(report):
@@ -411,7 +431,9 @@ def test_the_view_is_drawn_as_far_and_large_as_it_is(model, payload):
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
     room = 0.03 * (high - low).max()
     ranges = np.array(view["ranges"])
-    np.testing.assert_allclose(ranges, np.stack([low - room, high + room], 1), atol=1e-6)
+    np.testing.assert_allclose(
+        ranges, np.stack([low - room, high + room], 1), atol=1e-6
+    )
     sides = ranges[:, 1] - ranges[:, 0]
     np.testing.assert_allclose(view["aspect"], sides / sides.max(), rtol=1e-6)
     assert len(view["frusta"]) == 2
@@ -439,6 +461,61 @@ def test_a_row_of_points_is_level_by_the_images():
     axes = level_axes(row, np.zeros((1, 3)), top)
     np.testing.assert_allclose(axes[2], top)
     assert abs(axes[0] @ [1.0, 0.0, 0.0]) == pytest.approx(1.0)
+
+
+def test_lines_are_parted_where_edges_end():
+    vertices = np.arange(18.0).reshape(6, 3)
+    edges = np.array([[0, 1], [1, 2], [3, 4], [4, 5]])
+    first, second = strips(vertices, edges)
+    np.testing.assert_array_equal(first, vertices[:3])
+    np.testing.assert_array_equal(second, vertices[3:])
+
+
+def test_points_far_outside_are_left_out_by_the_span_of_the_rest(model):
+    """A row of 10 m along x: what is 9 m off its middle is not drawn, nor 9 m above."""
+    row = np.zeros((12, 3))
+    row[:, 0] = np.linspace(-5.0, 5.0, 12)
+    many = np.tile(row, (20, 1))
+    colors = np.zeros((len(many) + 1, 3), dtype=np.uint8)
+    covariances = np.tile(np.eye(3), (len(many) + 1, 1, 1))
+    for place, out in (
+        ([0.0, 7.0, 0.0], False),
+        ([0.0, 9.0, 0.0], True),
+        ([-9.0, 0.0, 0.0], True),
+    ):
+        scene = replace(model.scene, points=np.vstack([many, place]))
+        covariance = replace(result_of(scene).covariance, points=covariances)
+        with np.errstate(invalid="ignore"):
+            view = view_of(replace(model, scene=scene, colors=colors), covariance)
+        assert view.num_outlying == out
+        assert len(view.points) == len(many) + (not out)
+
+
+@pytest.mark.parametrize(("times", "moved"), [(900.0, False), (1200.0, True)])
+def test_a_far_world_is_drawn_from_a_round_place_in_it(model, times, moved):
+    scene = model.scene
+    centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
+    span = np.ptp(np.concatenate([scene.points, centers]), axis=0).max()
+    away = np.array([0.0, -times * span, 0.0])
+    shift = rigid3.from_rotmat(np.eye(3), -away)
+    far = replace(
+        scene,
+        points=scene.points + away,
+        rig_from_world=rigid3.compose(scene.rig_from_world, shift),
+    )
+    view = view_of(replace(model, scene=far), result_of(scene).covariance)
+    assert bool(np.any(view.origin)) == moved
+    assert np.array_equal(view.origin, np.round(view.origin))
+
+
+def test_every_so_many_frames_have_frusta_and_all_a_place(model, monkeypatch):
+    covariance = result_of(model.scene).covariance
+    everything = view_of(model, covariance)
+    monkeypatch.setattr("uwsfm.report.view.MAX_FRUSTA", 2)
+    view = view_of(model, covariance)
+    assert view.frusta_step == 2 and len(view.trajectory) == FRAMES
+    # Two of three frames are drawn.
+    assert 3 * len(view.frusta[0]) == 2 * len(everything.frusta[0])
 
 
 def test_the_caption_counts_what_is_drawn(report):
@@ -486,13 +563,46 @@ def test_other_files_are_told_with_their_numbers(tmp_path):
     written(tmp_path / "measured.json", {"measurements": items})
     told = dict(left_files(tmp_path, "report", "mm", 1e3))
     assert told["dense/cloud.ply"] == (
-        "dense cloud: 12345 points; standard deviation along the sight 0.21, 0.43, 0.87 "
-        "mm (5, 50, 95 %); noise of a disparity 0.12 px (assumed); 63% of the pixels "
+        "dense cloud: 12345 points; standard deviation along the sight 0.21, 0.43, "
+        "0.87 mm (5, 50, 95 %); noise of a disparity 0.12 px (assumed); 63% of the pixels "
         "have a depth"
     )
     assert told["measured.json"] == "measurements: 3, of these 2 determined"
     assert told["other.las"] == "cloud" and told["reef.glb"] == "mesh for the web"
     assert told["map/height.tif"] == "map"
+    written(
+        tmp_path / "map" / "height.json",
+        {
+            "num_columns": 640,
+            "num_rows": 480,
+            "resolution": 0.0042,
+            "share_with_data": 0.876,
+            "level": "level by its points",
+        },
+    )
+    written(
+        tmp_path / "reef.json",
+        {"reef": {"num_triangles": 7654}, "max_distance": 0.0123},
+    )
+    told = dict(left_files(tmp_path, "report", "mm", 1e3))
+    assert told["map/height.tif"] == (
+        "map: 640 x 480 cells of 4.2 mm, 88% with data, level by its points"
+    )
+    assert told["reef.glb"] == (
+        "mesh: 7654 triangles, none further than 12 mm from a point"
+    )
     units = dict(left_files(tmp_path, "report", "units", 1.0))
+    assert "cells of 0.0042 units" in units["map/height.tif"]
     assert "0.00021, 0.00043, 0.00087 units (5" in units["dense/cloud.ply"]
     assert numbers(units["measured.json"]) == [3, 2]
+
+
+def test_files_of_the_result_itself_and_of_other_kinds_are_not_listed(tmp_path):
+    for name in ("points.ply", "notes.txt", "sparse/a.ply", "report/a.tif", "b.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "uwsfm-work").mkdir()
+    (tmp_path / "uwsfm-work" / "a.ply").write_bytes(b"")
+    (tmp_path / "folder.ply").mkdir()
+    found = left_files(tmp_path, "report", "mm", 1e3)
+    assert found == (("b.obj", "mesh"),)

@@ -332,7 +332,10 @@ def split(name, far, *, numbers=True, missing=False):
             "ranges_m": [0.5, 1.5, 2.5, 3.5],
             "rms_px": [0.11 * far, 0.22 * far, None if missing else 0.33 * far, 0.44],
             "rms_mm": [1.1 * far, 2.2 * far, 3.3 * far, 4.4],
-            "px": [[[[far, 2 * far]]] * 2 + [[[3 * far, None]]] * 2, [[[9 * far, 12 * far]]] * 4],
+            "px": [
+                [[[far, 2 * far]]] * 2 + [[[3 * far, None]]] * 2,
+                [[[9 * far, 12 * far]]] * 4,
+            ],
         },
     }
 
@@ -366,6 +369,17 @@ def test_halves_of_the_worse_split_are_shown():
     units = halves_of(crossed(split("a", 1.0, missing=True), unit="units"))
     assert "2.2 thousandths of a unit at 1.5 units" in units["ranges"]
     assert "at 2.5 units" not in units["ranges"]
+
+
+def test_a_split_that_no_pixel_of_both_halves_sees_is_the_better_one():
+    blind, other = split("blind", 1.0), split("other", 0.1)
+    blind["projections"]["rms_px"] = [None] * 4
+    assert halves_of(crossed(blind, other))["split"] == "other"
+    calm = split("a", 1.0)
+    calm["projections"]["px"] = [[[[None, None]]] * 4] * 2
+    assert halves_payload(crossed(calm))["halves_limit"] == 1.0
+    calm["projections"]["px"] = [[[[1e-9, 1e-9]]] * 4] * 2
+    assert halves_payload(crossed(calm))["halves_limit"] == 1e-3
 
 
 def test_halves_that_have_nothing_to_differ_in_have_no_map():

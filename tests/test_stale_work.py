@@ -423,7 +423,11 @@ def test_a_depth_map_is_of_its_calibration(dense):
         for other in (camera.with_lens(row), camera.with_port(port)):
             cameras = list(scene.cameras)
             cameras[index] = other
-            assert changed(before, with_scene(dense, cameras=tuple(cameras))) == [0, 1, 2]
+            assert changed(before, with_scene(dense, cameras=tuple(cameras))) == [
+                0,
+                1,
+                2,
+            ]
     poses = scene.cam_from_rig.copy()
     poses[1, 4] += 1e-12
     assert changed(before, with_scene(dense, cam_from_rig=poses)) == [0, 1, 2]

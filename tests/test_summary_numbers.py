@@ -640,6 +640,8 @@ def test_halves_that_agree_or_have_nothing_to_differ_in():
 def test_the_frame_of_a_pose_is_the_rigs(result):
     """What the summary calls cam_from_rig brings points of the rig into the camera."""
     scene = result.scene
-    left, right = (rigid3.compose(p, scene.rig_from_world[1]) for p in scene.cam_from_rig)
+    left, right = (
+        rigid3.compose(p, scene.rig_from_world[1]) for p in scene.cam_from_rig
+    )
     assert np.allclose(left, scene.rig_from_world[1])
     assert np.linalg.norm(rigid3.inverse(right)[4:] - rigid3.inverse(left)[4:]) > 0.1

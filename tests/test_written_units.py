@@ -97,7 +97,9 @@ def test_the_unit_of_a_result_is_that_of_its_summary(tmp_path):
     assert unit_of_model(tmp_path) == "scale arbitrary"
     for text in ("[1]", '{"scale": '):
         path.write_text(text)
-        with pytest.raises(InputError, match="summary.json is damaged: run the command"):
+        with pytest.raises(
+            InputError, match="summary.json is damaged: run the command"
+        ):
             read_summary(tmp_path)
     with pytest.raises(InputError, match="nowhere: no such folder"):
         read_model(tmp_path / "nowhere")
@@ -179,7 +181,9 @@ def test_a_map_declares_its_scale_place_and_unit(height_map, tmp_path, unit, wri
     assert tags[33922] == (0.0, 0.0, 0.0, -7.5, 11.0, 0.0)
     version, *_, count = tags[34735][:4]
     assert version == 1 and len(tags[34735]) == 4 + 4 * count
-    keys = {tags[34735][i]: tags[34735][i + 1 : i + 4] for i in range(4, 4 + 4 * count, 4)}
+    keys = {
+        tags[34735][i]: tags[34735][i + 1 : i + 4] for i in range(4, 4 + 4 * count, 4)
+    }
     assert keys[1024] == (0, 1, 32767)  # a model of its own
     assert keys[1025] == (0, 1, 1)  # pixels are areas
     where, size, start = keys[1026]
