@@ -564,8 +564,8 @@ def test_other_files_are_told_with_their_numbers(tmp_path):
     told = dict(left_files(tmp_path, "report", "mm", 1e3))
     assert told["dense/cloud.ply"] == (
         "dense cloud: 12345 points; standard deviation along the sight 0.21, 0.43, "
-        "0.87 mm (5, 50, 95 %); noise of a disparity 0.12 px (assumed); 63% of the pixels "
-        "have a depth"
+        "0.87 mm (5, 50, 95 %); noise of a disparity 0.12 px (assumed); 63% of the "
+        "pixels have a depth"
     )
     assert told["measured.json"] == "measurements: 3, of these 2 determined"
     assert told["other.las"] == "cloud" and told["reef.glb"] == "mesh for the web"

@@ -57,6 +57,15 @@ def test_finished_steps_are_skipped(chain):
     assert set(steps.seconds()) == {"first", "second"}
 
 
+def test_times_are_of_finished_steps_and_of_the_run_that_took_them(chain):
+    steps = chain.run(second="c")
+    assert steps.of_earlier_runs() == ["first"]
+    with pytest.raises(KeyboardInterrupt):
+        chain.run(first="d", fails="first")
+    steps = Steps(chain.work_dir)
+    assert steps.seconds() == {} and steps.of_earlier_runs() == []
+
+
 def test_changed_inputs_restart_from_their_step(chain):
     chain.run(second="c")
     assert chain.take() == ["second"]
