@@ -1,5 +1,6 @@
 """A calibration result made by hand: a small scene, and covariances that are chosen."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from uwsfm.calibration.problem import (
     SolveHistory,
 )
 from uwsfm.colmap import Model
-from uwsfm.models.port import DomePort
+from uwsfm.models.port import DomePort, FlatPort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
@@ -142,3 +143,34 @@ def positions() -> PositionFit:
         scatter=1.5,
         covariance=covariance,
     )
+
+
+def leaning(x, y):
+    parts = [math.sin(math.radians(angle)) for angle in (x, y)]
+    return (*parts, math.sqrt(1.0 - sum(part**2 for part in parts)))
+
+
+PORTS = (
+    FlatPort(
+        normal=leaning(2.0, -3.0),
+        distance=0.02345,
+        thickness=0.0081,
+        n_glass=1.517,
+        n_water=1.341,
+    ),
+    FlatPort(
+        normal=leaning(-1.0, 4.0),
+        distance=0.0317,
+        thickness=0.0092,
+        n_glass=1.492,
+        n_water=1.342,
+    ),
+)
+
+
+STEEP = FlatPort(normal=leaning(-40.0, 25.0), distance=0.03)
+
+
+def with_ports(scene: Scene, ports=PORTS) -> Scene:
+    pairs = zip(scene.cameras, ports, strict=True)
+    return replace(scene, cameras=tuple(c.with_port(port) for c, port in pairs))

@@ -1,6 +1,5 @@
 """summary.json of a result that was made by hand: every number is where it belongs."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -9,17 +8,18 @@ import pytest
 from dense import dense_system
 from hand_made_result import (
     FRAMES,
+    PORTS,
     bars,
     camera_covariance,
     positions,
     result_of,
     small_model,
+    with_ports,
 )
 
 from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg
-from uwsfm.export.halves_summary import halves_numbers
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -27,26 +27,10 @@ from uwsfm.export.summary import (
     outside_summary,
     refined_summary,
     scale_summary,
-    versions,
-    write_json,
 )
-from uwsfm.export.verdict_summary import (
-    plain,
-    shown_word,
-    verdict_line,
-    verdict_note,
-    with_verdict,
-)
-from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort, NoPort
+from uwsfm.models.port import NoPort
 from uwsfm.residuals import border
-from uwsfm.scene import Scene
 from uwsfm.solver.layout import build_layout
-from uwsfm.trust.halves import Agreement, CrossValidation, Split
-from uwsfm.trust.projections import ProjectionMap
-from uwsfm.trust.reason import reason
-from uwsfm.trust.shared_numbers import SharedNumber
-from uwsfm.trust.verdict import Verdict
 
 
 @pytest.fixture(scope="module")
@@ -58,37 +42,6 @@ def model():
 def result(model):
     """Ports 23.45 and 31.7 mm away, leaning by (2, -3) and (-1, 4) degrees."""
     return result_of(with_ports(model.scene))
-
-
-def leaning(x, y):
-    parts = [math.sin(math.radians(angle)) for angle in (x, y)]
-    return (*parts, math.sqrt(1.0 - sum(part**2 for part in parts)))
-
-
-PORTS = (
-    FlatPort(
-        normal=leaning(2.0, -3.0),
-        distance=0.02345,
-        thickness=0.0081,
-        n_glass=1.517,
-        n_water=1.341,
-    ),
-    FlatPort(
-        normal=leaning(-1.0, 4.0),
-        distance=0.0317,
-        thickness=0.0092,
-        n_glass=1.492,
-        n_water=1.342,
-    ),
-)
-
-
-STEEP = FlatPort(normal=leaning(-40.0, 25.0), distance=0.03)
-
-
-def with_ports(scene: Scene, ports=PORTS) -> Scene:
-    pairs = zip(scene.cameras, ports, strict=True)
-    return replace(scene, cameras=tuple(c.with_port(port) for c, port in pairs))
 
 
 def test_ports_come_with_their_own_numbers(model, result):
@@ -392,256 +345,3 @@ def test_two_waters_are_named_by_their_cameras(model, result):
         ("water index at left", 1.341),
         ("water index at right", 1.342),
     ]
-
-
-def test_tilts_are_those_of_the_paper(result):
-    """n = (sin t cos p, sin t sin p, cos t): 2 and -3 degrees across make 3.6."""
-    found = paper_tilt(result, 0)
-    x, y, _ = PORTS[0].normal
-    assert found.azimuth_deg == pytest.approx(math.degrees(math.atan2(y, x)))
-    expected = math.degrees(math.asin(math.hypot(x, y)))
-    assert found.tilt_deg == pytest.approx(expected)
-
-
-def test_deviations_of_tilts_are_those_of_many_draws(result, rng):
-    """Normals drawn with the covariance of their tangents, from the images and in all:
-    20000 draws know a deviation to 0.5 %."""
-    from uwsfm.geometry import unit_vector
-
-    port, block = STEEP, np.array([[4.0, 1.5], [1.5, 2.0]]) * 1e-8
-    columns = result.covariance.border_cols[1, border.NORMAL]
-    matrix = result.covariance.border.copy()
-    matrix[np.ix_(columns, columns)] = block / 2.25  # neighbours share errors
-    angle = math.degrees(math.sqrt(np.trace(block)))
-    cameras = (camera_covariance(2.0), camera_covariance(4.0, normal_stddev_deg=angle))
-    given = result.covariance.in_all.given.copy()
-    rows = border.BORDER_SIZE + np.r_[border.NORMAL]
-    given[np.ix_(rows, rows)] = np.array([[3.0, -1.0], [-1.0, 7.0]]) * 1e-8
-    covariance = replace(
-        result.covariance,
-        border=matrix,
-        cameras=cameras,
-        in_all=replace(result.covariance.in_all, given=given),
-    )
-    scene = with_ports(result.scene, (PORTS[0], STEEP))
-    calibration = replace(result, scene=scene, covariance=covariance)
-    own, in_all = slope_stddevs_deg(calibration, 1)
-    tilt = paper_tilt(calibration, 1)
-    for total, slopes, azimuth, theta in (
-        (block, own, tilt.azimuth_stddev_deg, tilt.tilt_stddev_deg),
-        (
-            block + given[np.ix_(rows, rows)],
-            in_all,
-            tilt.azimuth_stddev_in_all_deg,
-            tilt.tilt_stddev_in_all_deg,
-        ),
-    ):
-        steps = rng.multivariate_normal(np.zeros(2), total, 20_000)
-        normals = port.normal + steps @ unit_vector.tangent_basis(port.normal).T
-        normals /= np.linalg.norm(normals, axis=1)[:, None]
-        spread = np.degrees(np.std(np.arcsin(normals[:, :2]), axis=0))
-        np.testing.assert_allclose(slopes, spread, rtol=0.02)
-        drawn = np.degrees(np.std(np.arctan2(normals[:, 1], normals[:, 0])))
-        assert azimuth == pytest.approx(drawn, rel=0.02)
-        drawn = np.degrees(np.std(np.arccos(normals[:, 2])))
-        assert theta == pytest.approx(drawn, rel=0.02)
-
-
-def test_a_held_tilt_has_no_deviation_and_a_wild_azimuth_half_a_turn(result):
-    columns = np.full((2, border.BORDER_SIZE), -1, dtype=np.int64)
-    held = replace(result.covariance, border_cols=columns, in_all=None)
-    found = paper_tilt(replace(result, covariance=held), 0)
-    assert found.tilt_stddev_deg is found.azimuth_stddev_in_all_deg is None
-    lost = (camera_covariance(2.0, normal_stddev_deg=math.inf), camera_covariance(4.0))
-    unknown = replace(result.covariance, cameras=lost)
-    with np.errstate(invalid="ignore"):
-        found = paper_tilt(replace(result, covariance=unknown), 0)
-    assert found.tilt_stddev_deg is found.azimuth_stddev_deg is None
-    straight = with_ports(result.scene, (FlatPort(distance=0.02), PORTS[1]))
-    found = paper_tilt(replace(result, scene=straight), 0)
-    assert found.azimuth_stddev_deg == 180.0 and found.tilt_deg == 0.0
-
-
-# ---- Words --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("word", "verdict", "expected"),
-    [
-        ("determined", "fits", "determined"),
-        ("determined", "doubtful", "doubtful"),
-        ("weakly determined", "doubtful", "doubtful"),
-        ("determined", "does not fit", "withheld"),
-        ("weakly determined", "does not fit", "withheld"),
-        ("held", "does not fit", "held"),
-        ("not determined", "doubtful", "not determined"),
-    ],
-)
-def test_no_word_is_better_than_the_verdict(word, verdict, expected):
-    assert shown_word(word, verdict) == expected
-
-
-def test_the_verdict_comes_first_and_tones_the_words_down():
-    because = (
-        reason("a", "It is so.", "doubtful", value=np.float64(0.25), lost=math.nan),
-        reason("b", "It is so too.", "doubtful"),
-    )
-    verdict = Verdict(verdict="doubtful", reasons=because, goodness=None)
-    camera = {"name": "left", "distance_verdict": "determined", "distance_m": 0.02}
-    summary = {
-        "cameras": [camera],
-        "scale": {"verdict": "determined", "unit": "metre"},
-        "verdict": "an older one",
-        "num_points": 3,
-    }
-    found = with_verdict(verdict, summary)
-    assert list(found) == [
-        "verdict",
-        "reasons",
-        "goodness",
-        "cameras",
-        "scale",
-        "num_points",
-    ]
-    assert found["verdict"] == "doubtful" and found["num_points"] == 3
-    assert found["reasons"][0] == {
-        "code": "a",
-        "text": "It is so.",
-        "severity": "doubtful",
-        "value": 0.25,
-        "lost": None,
-    }
-    assert found["cameras"] == [{**camera, "distance_verdict": "doubtful"}]
-    assert found["scale"] == {"verdict": "doubtful", "unit": "metre"}
-    assert verdict_line(found) == "Verdict: doubtful, for 2 reasons."
-    worse = with_verdict(replace(verdict, verdict="does not fit"), summary)
-    assert worse["scale"]["verdict"] == "withheld"
-    assert worse["cameras"][0]["distance_verdict"] == "withheld"
-    (note,) = verdict_note(found)
-    assert note.startswith("the verdict on this result is 'doubtful'")
-    assert note.endswith("far too small: It is so.")
-
-
-@pytest.mark.parametrize(
-    ("verdict", "scale", "expected"),
-    [
-        ("fits", "determined", "noise. Its scale is determined, as far as"),
-        ("fits", "weakly determined", "noise. Its scale is weakly determined, as"),
-        ("fits", "arbitrary", "Verdict: fits. The model explains the images within"),
-        ("does not fit", "determined", "Verdict: does not fit, for one reason."),
-        (None, "determined", "No verdict: an earlier version of uwsfm made this"),
-    ],
-)
-def test_the_first_line_says_the_verdict(verdict, scale, expected):
-    line = verdict_line(
-        {"verdict": verdict, "scale": {"verdict": scale}, "reasons": [{}]}
-    )
-    assert expected in line
-    assert ("Its scale" in line) == (verdict == "fits" and scale != "arbitrary")
-
-
-def test_what_fits_has_no_note():
-    assert verdict_note({"verdict": "fits"}) == () == verdict_note({})
-
-
-def test_plain_data_is_what_json_has(tmp_path):
-    found = plain(
-        {"a": np.array([1.5, np.nan]), "b": (math.inf, [np.array([[2.0]])]), "c": "x"}
-    )
-    assert found == {"a": [1.5, None], "b": [None, [[[2.0]]]], "c": "x"}
-    assert plain(camera_covariance(2.0))["distance_stddev_m"] == pytest.approx(0.00104)
-    write_json({"a": 1.5}, tmp_path / "a.json")
-    text = (tmp_path / "a.json").read_text(encoding="utf-8")
-    assert json.loads(text) == {"a": 1.5} and text.endswith("}\n")
-    with pytest.raises(ValueError, match="JSON compliant"):
-        write_json({"a": math.nan}, tmp_path / "b.json")
-    assert not (tmp_path / "b.json").exists()
-    assert {"python", "uwsfm", "numpy", "pycolmap"} <= set(versions())
-
-
-# ---- Halves -------------------------------------------------------------------------
-
-
-def projections():
-    """0.11, 0.22, ... px apart at five ranges, in both cameras alike."""
-    far = np.arange(1.0, 6.0)[None, :, None, None] * np.ones((2, 1, 3, 4))
-    ranges = np.array([0.71, 1.12, 1.53, 2.94, 3.85])
-    return ProjectionMap(ranges_m=ranges, px=0.111 * far, mm=1.25 * far)
-
-
-def cross_validation(*, ratio=1.72, p_value=0.001, numbers=True, unit="m"):
-    number = SharedNumber(
-        group="distance",
-        name="distance of left",
-        camera=0,
-        unit="mm",
-        values=(19.1, 20.2),
-        stddev=0.55,
-        stddev_in_all=0.88,
-    )
-    agreement = Agreement(
-        group="distance", ratio=ratio, num_independent=2.0, p_value=p_value
-    )
-    split = Split(
-        name="odd and even",
-        num_frames=(11, 12),
-        num_observations=(3100, 3200),
-        sigma_px=(0.31, 0.32),
-        numbers=(number,) if numbers else (),
-        agreements=(agreement,),
-        lengths=None,
-        projections=projections(),
-    )
-    return CrossValidation(splits=(split,), omitted=("No more.",), unit=unit)
-
-
-def test_halves_are_told_at_the_middle_range():
-    found = halves_numbers(cross_validation())
-    first, second, third = found["sentences"]
-    assert "odd and even (11 and 12 frames, each adjusted alone)" in first
-    assert "project 0.33 px apart, which is 3.8 mm at 1.5 m" in first
-    assert "by 1.7 times what their standard deviations predict" in second
-    assert "enlarged by 1.7." in second and third == "No more."
-    assert found["enlarged"] == {"distance": 1.72} and found["omitted"] == ["No more."]
-    (split,) = found["splits"]
-    assert split["name"] == "odd and even" and split["lengths"] is None
-    assert split["num_frames"] == [11, 12]
-    assert split["num_observations"] == [3100, 3200]
-    assert split["sigma_px"] == [0.31, 0.32]
-    (number,) = split["numbers"]
-    assert (number["name"], number["group"]) == ("distance of left", "distance")
-    assert number["unit"] == "mm" and number["values"] == [19.1, 20.2]
-    assert number["difference"] == pytest.approx(1.1)
-    assert (number["stddev"], number["stddev_in_all"]) == (0.55, 0.88)
-    assert number["z"] == pytest.approx(2.0)
-    (agreement,) = split["agreements"]
-    assert (agreement["ratio"], agreement["p_value"]) == (1.72, 0.001)
-    maps = split["projections"]
-    assert maps["ranges_m"] == [0.71, 1.12, 1.53, 2.94, 3.85]
-    assert maps["rms_px"] == pytest.approx([0.111, 0.222, 0.333, 0.444, 0.555])
-    assert maps["rms_mm"] == pytest.approx([1.25, 2.5, 3.75, 5.0, 6.25])
-    assert maps["px"][1][2][0][0] == pytest.approx(0.333)
-    assert maps["mm"][1][2][0][0] == pytest.approx(3.75)
-
-
-def test_halves_that_agree_or_have_nothing_to_differ_in():
-    for calm in (cross_validation(ratio=0.9), cross_validation(p_value=0.02)):
-        assert not calm.enlarged
-        sentences = halves_numbers(calm)["sentences"]
-        assert sentences[1].startswith("The halves differ by no more than")
-    nothing = halves_numbers(cross_validation(numbers=False))["sentences"]
-    assert "have nothing to differ in but poses and points" in nothing[0]
-    units = halves_numbers(cross_validation(unit="units"))["sentences"]
-    assert "3.8 thousandths of a unit at 1.5 units" in units[0]
-    none = CrossValidation(unit="m", splits=(), omitted=("Too few frames.",))
-    assert halves_numbers(none)["sentences"] == ["Too few frames."]
-
-
-def test_the_frame_of_a_pose_is_the_rigs(result):
-    """What the summary calls cam_from_rig brings points of the rig into the camera."""
-    scene = result.scene
-    left, right = (
-        rigid3.compose(p, scene.rig_from_world[1]) for p in scene.cam_from_rig
-    )
-    assert np.allclose(left, scene.rig_from_world[1])
-    assert np.linalg.norm(rigid3.inverse(right)[4:] - rigid3.inverse(left)[4:]) > 0.1

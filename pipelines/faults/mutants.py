@@ -45,11 +45,11 @@ FIRST_SECONDS = 900.0
 """Of tests without a fault, which may have to compile kernels."""
 
 _TABLES = ("test_printed_tables.py",)
-_SUMMARY = ("test_summary_numbers.py",)
-_REPORT = ("test_report_words.py", "test_report_numbers.py")
-_MEASURED = ("test_measure_table.py",)
+_SUMMARY = ("test_summary_numbers.py", "test_summary_words.py")
+_REPORT = ("test_report_words.py", "test_report_numbers.py", "test_report_plots.py")
+_MEASURED = tuple(f"test_measure_{k}.py" for k in ("table", "numbers", "spots"))
 _LENGTHS = (
-    *("test_known_lengths.py", "test_length_verdicts.py"),
+    *("test_known_lengths.py", "test_length_verdicts.py", "test_lengths_placed.py"),
     "test_lengths_file.py::test_wrong_positions_end_inone_sentence",
     "test_lengths_file.py::test_wrong_lengths_end_inone_sentence",
 )
@@ -68,7 +68,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "export/summary.py": _SUMMARY,
         "export/verdict_summary.py": _SUMMARY,
         "export/halves_summary.py": _SUMMARY,
-        "calibration/tilt.py": _SUMMARY,
+        "calibration/tilt.py": ("test_tilt.py",),
         "export/housing.py": ("test_housing_comments.py",),
         "export/files.py": ("test_written_units.py",),
         "surface/units.py": ("test_written_units.py",),
@@ -105,7 +105,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "sfm/steps.py": _STEPS,
         "sfm/start.py": _STEPS,
         "sfm/refractive_steps.py": _STEPS,
-        "dense/maps.py": _STEPS,
+        "dense/maps.py": ("test_stale_depth_maps.py",),
     },
 }
 """Modules of a kind, and the fast tests that concern each."""
