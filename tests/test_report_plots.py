@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hand_made import summary
+from hand_made_residuals import camera, residuals
 from hand_made_result import FRAMES, result_of
 from report_pages import model_that_misses, payload_of, report_of, text_of
 
@@ -16,7 +17,6 @@ from uwsfm.geometry import rigid3
 from uwsfm.report.gather import _coverage, numbers_of
 from uwsfm.report.page import page_of, scales_of
 from uwsfm.report.view import level_axes, strips, view_of
-from uwsfm.trust.residuals import CameraResiduals, Profile, Residuals
 
 
 @pytest.fixture(scope="module")
@@ -35,44 +35,6 @@ def payload(report):
 
 
 # ---- Residuals ----------------------------------------------------------------------
-
-
-def residuals(rms, systematic, cells=0.2, radius=(0.1, -0.3), depth=(0.05, 0.02)):
-    def profile(mean, spread):
-        values = np.array([mean, np.nan])
-        return Profile(
-            name="near",
-            span=(0.5, 1.5),
-            at=np.array([10.0, 20.0]),
-            mean_px=values,
-            stderr_px=np.array([spread, np.nan]),
-        )
-
-    grid = np.full((3, 4, 2), np.nan)
-    grid[0, 0] = (0.6 * cells, 0.8 * cells)  # as long as ``cells``
-    return Residuals(
-        cells_px=grid,
-        by_radius=(profile(*radius[:1], 0.04), profile(radius[1], 0.05)),
-        by_depth=(profile(depth[0], 0.01), profile(depth[1], 0.02)),
-        rms_px=rms,
-        systematic_px=systematic,
-    )
-
-
-def camera(name="left", **more):
-    return CameraResiduals(
-        **{
-            "name": name,
-            "size": (800, 600),
-            "counts": np.full((3, 4), 9, dtype=np.int64),
-            "refractive": residuals(0.456, 0.0314),
-            "model": "OPENCV",
-            "pinhole": residuals(1.234, 0.567, cells=0.5),
-            "freed": None,
-            "least_central_px": None,
-            **more,
-        }
-    )
 
 
 def test_maps_and_profiles_share_their_scales():

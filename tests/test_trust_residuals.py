@@ -69,6 +69,37 @@ def test_a_shift_of_all_pixels_is_systematic_and_noise_is_not(rng):
     )
 
 
+def test_profiles_are_positive_where_the_model_projects_too_far_out():
+    """By 0.1, 0.2 and 0.3 px in the near, middle and far third of a camera's
+    observations, and so much too far in for the other camera."""
+    scene = bare(simulated_dive(num_frames=6, num_points=2000).truth)
+    depth, xy = scene.points_in_cam()[:, 2], scene.xy.copy()
+    by = np.zeros(len(xy))
+    for c, sign in ((0, 1.0), (1, -1.0)):
+        mine = scene.camera_idx == c
+        limits = np.quantile(depth[mine], [1.0 / 3.0, 2.0 / 3.0])
+        by[mine] = 0.1 * (1 + np.searchsorted(limits, depth[mine]))
+        outwards = xy[mine] - scene.cameras[c].lens[2:4]
+        outwards /= np.linalg.norm(outwards, axis=1)[:, None]
+        xy[mine] -= sign * by[mine][:, None] * outwards
+    found = camera_residuals(replace(scene, xy=xy), ["left", "right"])
+    for camera, sign in zip(found, (1.0, -1.0), strict=True):
+        thirds = camera.refractive.by_radius
+        assert [part.name for part in thirds] == ["near", "middle", "far"]
+        for part, px in zip(thirds, (0.1, 0.2, 0.3), strict=True):
+            known = np.isfinite(part.mean_px)
+            # One or two observations at the limit of two thirds may be in the other.
+            np.testing.assert_allclose(part.mean_px[known], sign * px, atol=0.01)
+            assert known.any() and np.all(np.diff(part.at[known]) > 0.0)
+        for half in camera.refractive.by_depth:
+            known = np.isfinite(half.mean_px)
+            at, mean = half.at[known], sign * half.mean_px[known]
+            assert np.all(np.diff(at) > 0.0) and np.all(np.diff(mean) > -0.01)
+            near, far = np.percentile(depth, [1.0, 99.0])
+            assert near < at[0] < at[-1] < far  # metres
+            assert mean[0] < 0.15 and mean[-1] > 0.25
+
+
 def test_the_sample_rig_has_no_camera_without_observations():
     scene = simulated_dive(num_frames=3, num_points=300).scene
     only_left, _ = scene.select(scene.camera_idx == 0)
