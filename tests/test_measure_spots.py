@@ -80,11 +80,21 @@ def test_points_and_places_of_the_model(result):
     assert second.moved_by == pytest.approx(0.0005)
     for spot, point in ((first, 0), (second, 4)):
         assert spot.num_images == np.count_nonzero(scene.point_idx == point)
+    # Picked in two ways it is one place, whose errors are shared.
+    with pytest.raises(InputError, match="places 1 and the next are one"):
+        one(result, distances=[{"ends": [5, near]}])
     last = scene.num_points
     assert one(result, distances=[{"ends": [1, last]}]).value > 0.0
     for wrong in (0, last + 1):
-        with pytest.raises(InputError, match=f"the ids run from 1 to {last}"):
+        with pytest.raises(InputError, match=f"the ids run from 1 to {last}") as error:
             one(result, distances=[{"ends": [1, wrong]}])
+        assert str(error.value).startswith(
+            f"distances[0].ends[1]: point {wrong}: there"
+        )
+    outside = [{"image": "left/0000.jpg", "xy": [900.0, 2.0]}, *clicked(result, 4)[:1]]
+    with pytest.raises(InputError, match="is outside of left/0000.jpg") as error:
+        one(result, distances=[{"ends": [1, outside]}])
+    assert str(error.value).count("distances[0].ends[1]") == 1
 
 
 def plane_cloud(folder, stddev, result):
