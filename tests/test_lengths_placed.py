@@ -185,6 +185,10 @@ def test_names_and_pixels_that_no_image_has_are_named(model, tmp_path):
     with pytest.raises(InputError, match=r"frame 'a' is not .* \(nor are 2 more\)"):
         table.check_names(model.rig, model.frame_names)
     table.check_names(model.rig, tuple("abc"))
+    with pytest.raises(InputError, match=r"frame 'b' is not .* \(nor are 1 more\)"):
+        table.check_names(model.rig, ("a",))
+    with pytest.raises(InputError, match="whose names are like 'a'$"):
+        table.check_names(model.rig, ("a", "b"))
 
 
 BARS_FIRST = ("left/0000.jpg", (1.0, 2.0))
@@ -214,6 +218,7 @@ def test_a_lever_arm_is_three_numbers_of_some_metres(tmp_path, arm, words):
     nav.write_text("frame,x,y,z,sx,sy,sz\n" + rows)
     if words is None:
         assert KnownLengths.read(None, nav, arm).lever_arm.tolist() == arm
+        assert KnownLengths.read(None, nav, [1, 2, 3]).lever_arm.dtype == float
         with pytest.raises(InputError, match="has no effect without positions"):
             KnownLengths.read(None, None, arm)
     else:
@@ -299,6 +304,11 @@ def test_degrees_and_millimetres_are_no_positions(tmp_path, step, at, height, wo
     else:
         with pytest.raises(InputError, match=words):
             load_positions(path)
+
+
+def test_units_are_looked_for_in_all_positions_and_in_no_deviation(tmp_path):
+    near = [f"{k},{0.001 * k},0,0,1,1,20000" for k in range(3)]
+    assert len(load_positions(nav(tmp_path, [*near, "far,10,0,0,1,1,1"])).frames) == 4
 
 
 def test_another_header_is_refused_with_the_right_one(tmp_path):
