@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,9 +40,14 @@ class Keys(Steps):
     def __init__(self, work_dir: Path) -> None:
         super().__init__(work_dir)
         self.keys: dict[str, str] = {}
+        self.outputs: dict[str, list[str]] = {}
+        self.clear: dict[str, Callable[[], None]] = {}
 
     def run(self, name, inputs, action, *, outputs, clear=None):
         self.keys[name] = fingerprint(inputs)
+        self.outputs[name] = [path.name for path in outputs]
+        if clear is not None:
+            self.clear[name] = clear
         if name == "mapping":
             raise Finished
         return self.keys[name]
@@ -70,6 +76,10 @@ REFRACTIVE = StartOptions(mapper="refractive")
 
 def keys_of(images, rig=RIG, options=REFRACTIVE):
     """The key of each step of a run on these images."""
+    return steps_of(images, rig, options).keys
+
+
+def steps_of(images, rig=RIG, options=REFRACTIVE):
     steps = Keys(images.parent / "work")
     space = Workspace(work_dir=steps.work_dir)
     pycolmap.Database.open(str(space.features)).close()
@@ -78,7 +88,7 @@ def keys_of(images, rig=RIG, options=REFRACTIVE):
     key = match_images(rig, frames, steps, space, options, print)
     with pytest.raises(Finished):
         start_from_matches(rig, frames, steps, key, options)
-    return steps.keys
+    return steps
 
 
 def again(before, after):
@@ -289,15 +299,69 @@ def test_one_camera_is_scaled_by_the_distance_that_is_given(images):
 
 
 def test_a_long_survey_is_mapped_in_parts(images):
-    for k in range(4, 24):
-        for folder in ("left", "right"):
-            (images / folder / f"{k:04}.png").write_bytes(b"x")
-    options = replace(REFRACTIVE, mapping=MappingOptions(submap_frames=20))
+    options = more_frames(images)
     before = keys_of(images, options=options)
     assert list(before) == [*FRONT, "verification", "submaps", "mapping"]
     larger = replace(REFRACTIVE, mapping=MappingOptions(submap_frames=21))
     after = keys_of(images, options=larger)
     assert again(before, after) == ["submaps", "mapping"]
+
+
+def more_frames(images):
+    for k in range(4, 24):
+        for folder in ("left", "right"):
+            (images / folder / f"{k:04}.png").write_bytes(b"x")
+    return replace(REFRACTIVE, mapping=MappingOptions(submap_frames=20))
+
+
+def test_a_step_has_its_outputs_and_leaves_nothing_of_other_inputs(images):
+    open_rig = replace(RIG, cam_from_rig=None)
+    steps = steps_of(images, open_rig, more_frames(images))
+    assert steps.outputs == {
+        "features": ["database.db"],
+        "matches": ["database.db"],
+        "rig": ["rig.json"],
+        "verification": ["mapping.db"],
+        "submaps": ["submaps"],
+        "mapping": ["refractive"],
+    }
+    pinhole = steps_of(images, options=replace(REFRACTIVE, mapper="pinhole"))
+    assert pinhole.outputs["mapping"] == ["perspective"]
+    space = Workspace(work_dir=steps.work_dir)
+    left = [space.submaps, steps.work_dir / "matches", steps.work_dir / "features"]
+    left.append(space.colors)
+    for folder in left:
+        folder.mkdir()
+        (folder / "old").write_text("of other inputs")
+    with pycolmap.Database.open(str(space.features)) as database:
+        pair = two_images(database)
+        database.write_matches(*pair, np.array([[0, 0]], dtype=np.uint32))
+    assert set(steps.clear) == {"features", "matches", "submaps"}
+    for name, gone in (
+        ("submaps", left[:1]),
+        ("matches", left[:2]),
+        ("features", left),
+    ):
+        for _ in range(2):  # what is not there is no mistake
+            steps.clear[name]()
+        assert [folder for folder in left if not folder.exists()] == gone
+        if name == "matches":
+            with pycolmap.Database.open(str(space.features)) as database:
+                assert not database.exists_matches(*pair)
+    assert not space.features.exists()
+
+
+def two_images(database):
+    """Identifiers of two images with a keypoint each."""
+    camera = pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3])
+    camera_id = database.write_camera(camera)
+    pair = [
+        database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+        for name in ("left/a", "left/b")
+    ]
+    for image in pair:
+        database.write_keypoints(image, np.ones((1, 2), dtype=np.float32))
+    return pair
 
 
 # ---- Fingerprints -------------------------------------------------------------------
