@@ -118,7 +118,7 @@ ONLY = {
         "_rig_content",
     ),
     "sfm/refractive_steps.py": ("map_refractively",),
-    "dense/maps.py": ("_key", "_path", "read", "require_images", "prepare_errors"),
+    "dense/maps.py": ("_key", "_path", "read", "require_images"),
 }
 """Functions of a module that make keys; what steps do has tests that take longer."""
 
