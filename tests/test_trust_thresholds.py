@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwsfm.sfm.noise_floor import NoiseFloor
-from uwsfm.trust.free_lens import FreeLens
+from uwsfm.trust.freed import Freed
 from uwsfm.trust.given import Departure
 from uwsfm.trust.goodness import CameraFit, Goodness, Part, Used
 from uwsfm.trust.verdict import verdict_on
@@ -39,7 +39,8 @@ FINE = Goodness(
     used=Used(num_frames=100, num_registered=100, num_tested=1000, num_kept=900),
     converged=True,
     departures=(),
-    free_lens=None,
+    freed_lenses=None,
+    freed_placement=None,
     below_zero_z=None,
     known_length_z=None,
     positions_scatter=None,
@@ -128,16 +129,51 @@ def test_it_is_the_lens_if_half_vanishes_with_it(freed, told):
         (1e-6, 4.95, True),
     ],
 )
-def test_free_lenses_have_to_be_seen_by_all_points(p_value, evenness, told):
-    free = FreeLens(
-        px=0.2, p_value=p_value, gain=99.0, num_freed=8, sigma_px=0.4, evenness=evenness
+def test_what_is_set_free_has_to_be_seen_by_all_points(p_value, evenness, told):
+    free = freed(p_value=p_value, evenness=evenness)
+    for field, code in (
+        ("freed_lenses", "lenses_do_not_fit"),
+        ("freed_placement", "placement_does_not_fit"),
+    ):
+        assert found(**{field: free}) == ({code: DOUBTFUL} if told else {})
+
+
+def freed(px=0.2, **more):
+    return Freed(
+        **{
+            "px": px,
+            "p_value": 1e-6,
+            "gain": 99.0,
+            "num_freed": 8,
+            "sigma_px": 0.4,
+            "evenness": 5.0,
+            **more,
+        }
     )
-    reasons = found(free_lens=free)
-    assert reasons == ({"lenses_do_not_fit": DOUBTFUL} if told else {})
-    for sigma, words in ((0.55, "the lenses, as given"), (0.6, "not the lenses alone")):
-        if told:
-            goodness = replace(FINE, free_lens=replace(free, sigma_px=sigma))
-            assert words in verdict_on(goodness).reasons[0].text
+
+
+def test_what_takes_more_of_the_residuals_is_named():
+    lenses, placement = "lenses_do_not_fit", "placement_does_not_fit"
+    for of_lenses, of_placement, code in ((0.2, 0.21, placement), (0.21, 0.2, lenses)):
+        reasons = found(
+            freed_lenses=freed(of_lenses), freed_placement=freed(of_placement)
+        )
+        assert reasons == {code: DOUBTFUL}
+
+
+@pytest.mark.parametrize(
+    ("sigma", "lens", "placement"),
+    [
+        # 1.15 times a floor of 0.5 px.
+        (0.55, "the lenses, as given, do not fit", "cam_from_rig, as held, does not"),
+        (0.60, "it is not the lenses alone", "it is not the placement alone"),
+    ],
+)
+def test_noise_that_is_left_has_another_cause(sigma, lens, placement):
+    for field, words in (("freed_lenses", lens), ("freed_placement", placement)):
+        goodness = replace(FINE, **{field: freed(sigma_px=sigma)})
+        (reason,) = verdict_on(goodness).reasons
+        assert words in reason.text and "0.2 px of the residuals vanish" in reason.text
 
 
 @pytest.mark.parametrize(
