@@ -60,7 +60,7 @@ _EXCHANGED = {
 }
 _IDENTITIES = ("sqrt", "abs", "degrees", "radians", "asin", "nan_to_num")
 _FORM = {"strict", "encoding", "title_justify", "caption_justify", "no_wrap", "title"}
-_FORM |= {"show_header", "style", "justify", "fontsize", "frameon"}
+_FORM |= {"show_header", "style", "justify", "fontsize", "frameon", "indent"}
 """Arguments that change no number: checks, encodings, layout."""
 _UNITS = {
     **{"mm": "m", "m": "mm", "px": "mm", "deg": "rad", "%": "", "cm2": "m2"},
