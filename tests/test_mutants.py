@@ -37,7 +37,6 @@ def length(camera, own, total):
         ("unit", "f'{1000.0 * own:.2f} m'"),
         ("exchanged", "camera['value_mm'] + camera['value_mm']"),
         ("exchanged", "min(own, total)"),
-        ("exchanged", "max(total, own)"),
         ("exchanged", "camera.a_stddev)"),
         ("condition", "if not (camera.a_stddev is not None and own < 2.5):"),
     ],

@@ -58,6 +58,8 @@ _EXCHANGED = {
     **{"asin": "sin", "nanmean": "nansum", "median": "mean", "argmin": "argmax"},
     **{"hypot": "dist", "nanmedian": "nanmean", "floor": "ceil", "minimum": "maximum"},
 }
+_EITHER_WAY = {"min", "max", "hypot", "maximum", "minimum"}
+"""Calls whose arguments may be exchanged."""
 _IDENTITIES = ("sqrt", "abs", "degrees", "radians", "asin", "nan_to_num")
 _FORM = {"strict", "encoding", "title_justify", "caption_justify", "no_wrap", "title"}
 _FORM |= {"show_header", "style", "justify", "fontsize", "frameon", "indent"}
@@ -173,6 +175,8 @@ def _is_left_alone(child: ast.AST, holder: ast.AST) -> bool:
     if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Import)):
         return True
     if isinstance(child, (ast.ImportFrom, ast.Assert, ast.Global, ast.arguments)):
+        return True
+    if isinstance(holder, ast.ExceptHandler) and child is holder.type:
         return True
     if isinstance(holder, ast.Call) and getattr(holder.func, "id", "") == "isinstance":
         return True
@@ -295,19 +299,17 @@ class _Names:
     _list = _tuple
 
     def _call(self, node: ast.Call) -> Iterator[tuple[str, ast.AST]]:
-        if getattr(node.func, "id", "") == "isinstance":
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if name == "isinstance":
             return
-        for k in range(len(node.args) - 1):
-            yield (
-                "exchanged",
-                ast.Call(node.func, _swapped(node.args, k), node.keywords),
-            )
+        for k in range(len(node.args) - 1 if name not in _EITHER_WAY else 0):
+            swapped = _swapped(node.args, k)
+            yield "exchanged", ast.Call(node.func, swapped, node.keywords)
         for k, keyword in enumerate(node.keywords):
             if keyword.arg in _FORM:
                 continue
             kept = [*node.keywords[:k], *node.keywords[k + 1 :]]
             yield "left out", ast.Call(node.func, node.args, kept)
-        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if name in _EXCHANGED:
             other: ast.expr = ast.Name(_EXCHANGED[name], ast.Load())
             if isinstance(node.func, ast.Attribute):
