@@ -63,7 +63,8 @@ def test_points_have_the_mean_of_their_errors(model, tmp_path):
         np.testing.assert_allclose(rows[name], scene.points[:, axis], rtol=1e-6)
     for channel, name in enumerate(("red", "green", "blue")):
         assert np.array_equal(rows[name], model.colors[:, channel])
-    assert "depth_stddev_m" not in rows.dtype.names
+    own = ("id", "track_length", "reprojection_error_px")
+    assert rows.dtype.names == (*"xyz", "red", "green", "blue", *own)
     export_ply(moved, tmp_path / "q.ply")
     assert "unit: metre" in read_points(tmp_path / "q.ply")[1]
 
