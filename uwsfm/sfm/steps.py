@@ -21,7 +21,7 @@ FORMAT = 1
 
 
 def fingerprint(inputs: Any) -> str:
-    """A short hash of anything JSON can hold, paths, arrays and dataclasses included."""
+    """A short hash of anything JSON can hold, and of paths, arrays and dataclasses."""
     text = json.dumps(inputs, sort_keys=True, default=_as_json)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
