@@ -1,6 +1,5 @@
 """The seed decides the random choices, and nothing else does."""
 
-
 import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
