@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dense_scenes import Plane
+from dense_scenes import Plane, range_errors
 
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.dense.calibration_error import CalibrationError
@@ -14,7 +14,6 @@ from uwsfm.dense.options import DenseOptions, bytes_of
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.rays import closest_points
 from uwsfm.residuals import border
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
@@ -176,32 +175,14 @@ def test_uncertain_ports_make_the_depths_uncertain(how):
         error[covariance.border_cols[camera, slot]] = amount
     only = np.outer(error, error)  # one error, in all of them at once
     found = CalibrationError(scene, replace(covariance, border=only), (0, 1), 1.0, 3.0)
-    left, right = scene.cameras
     # Nodes of the grid: 8 by 6 steps between the outer pixels of 800 x 600, and three
     # in the inverse range from 1 to 1/3.
     xy = np.array([[400.0, 300.0], [0.5 + 799.0 / 4.0, 0.5 + 599.0 / 3.0]])
     ranges = 1.0 / np.array([5.0 / 9.0, 7.0 / 9.0])
-    pose = scene.cam_from_rig[1]
-    origins, dirs = left.ray_from_img(xy)
-    shown, _ = right.img_from_point(
-        rigid3.transform(pose, origins + ranges[:, None] * dirs)
-    )
-
-    def moved(camera, index):
-        amount = OFF_BY[how].get((index, border.DISTANCE), 0.0)
-        port = camera.port
-        return camera.with_port(replace(port, distance=port.distance + amount))
-
-    origins, dirs = moved(left, 0).ray_from_img(xy)
-    starts, ways = moved(right, 1).ray_from_img(shown)
-    back = rigid3.inverse(pose)
-    reached = closest_points(
-        origins, dirs, rigid3.transform(back, starts), rigid3.rotate(back, ways)
-    )[1][:, 0]
+    amounts = [OFF_BY[how].get((camera, border.DISTANCE), 0.0) for camera in (0, 1)]
+    expected = np.abs(range_errors(scene, amounts, xy, ranges))
     # To first order: 2 mm of a port at 2 cm.
-    np.testing.assert_allclose(
-        found.stddev(xy, ranges), np.abs(reached - ranges), rtol=0.03
-    )
+    np.testing.assert_allclose(found.stddev(xy, ranges), expected, rtol=0.03)
 
 
 def test_depth_maps_come_back_or_are_made_again(tmp_path):

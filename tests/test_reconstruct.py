@@ -8,9 +8,11 @@ import pycolmap
 import pytest
 
 import uwsfm
+from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.demo import MAX_FEATURES, run_demo, sample_dir
 from uwsfm.evaluate import Comparison
 from uwsfm.pipeline import ReconstructResult
+from uwsfm.sfm.refine import rig_options
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +52,23 @@ def test_errors_are_what_the_standard_deviations_promise(comparison):
         assert abs(camera.distance_error_m) <= 3.0 * camera.distance_stddev_m
         # And they promise something: the sample was made to determine the housings.
         assert camera.distance_stddev_m < 0.5e-3
+
+
+def test_standard_deviations_are_those_of_the_noise_found(result):
+    """The Cramer-Rao bound of the same views at the noise found; the larger of two
+    estimates is reported, of 112 quarters of images."""
+    scene, sigma = result.calibration.scene, result.calibration.summary.sigma_px
+    bound = predict_covariance(scene, sigma, **rig_options(result.model.rig))
+    for one, best in zip(
+        result.calibration.covariance.cameras, bound.cameras, strict=True
+    ):
+        assert 0.9 < one.distance_stddev_m / best.distance_stddev_m < 2.0
+        assert 0.9 < one.normal_stddev_deg / best.normal_stddev_deg < 2.0
+    found, expected = (
+        np.sqrt(np.einsum("pii->p", c.points))
+        for c in (result.calibration.covariance, bound)
+    )
+    np.testing.assert_allclose(np.median(found / expected), 1.0, atol=0.05)
 
 
 def test_scale_is_metric(comparison):
@@ -94,9 +113,18 @@ def test_outputs_open_elsewhere_and_here(demo):
 def test_points_have_believable_uncertainties(result):
     cov = result.calibration.covariance.points
     stddev = np.sqrt(np.einsum("pii->p", cov))
-    # A pixel of 0.2 px noise at 1 m with 0.6 m of motion: a millimetre or so.
     assert np.all(np.isfinite(stddev))
-    assert 1e-4 < np.median(stddev) < 5e-3
+    # By the angle between the outermost of a point's rays, f = 590 px: noise / f times
+    # the range over that angle, and no less than the noise of a mean of its images.
+    scene, noise = result.calibration.scene, result.calibration.summary.sigma_px
+    _, dirs = scene.water_rays()
+    ranges = np.linalg.norm(scene.points_in_cam(), axis=1)
+    for p in range(0, scene.num_points, 97):
+        rows = np.flatnonzero(scene.point_idx == p)
+        angle = np.arccos(np.clip((dirs[rows] @ dirs[rows].T).min(), -1.0, 1.0))
+        of_pixel = noise * ranges[rows].mean() / 590.0
+        least = of_pixel / np.sqrt(len(rows))
+        assert least < stddev[p] < 3.0 * of_pixel / angle + 3.0 * of_pixel
 
 
 def test_second_run_starts_from_what_is_on_disk(demo):
