@@ -64,8 +64,8 @@ def test_what_is_measured_agrees_with_the_truth(opened, spots, tmp_path):
     scale = opened.calibration.covariance.scale_stddev
     for item, true in zip(result.measurements[:9], expected, strict=False):
         # The scale's deviation is in every length. Beside it two ends, each clicked to
-        # half a pixel, 1.3 mm at 1.5 m (some are at 1 m): better across the sight as a mean of eleven
-        # images, worse along it, where the rays meet at half a radian.
+        # half a pixel, 1.3 mm at 1.5 m (some are at 1 m): better across the sight as a
+        # mean of eleven images, worse along it: rays meet at half a radian.
         clicked = np.sqrt(2.0) * CLICK_PX * 1.5 / 591.0
         assert item.stddev > np.hypot(0.9 * scale * true, 0.7 * clicked / np.sqrt(11.0))
         assert item.stddev < np.hypot(1.6 * scale * true, 1.6 * clicked)

@@ -1,4 +1,4 @@
-"""What may be skipped where everything is installed: tests of images that are not here."""
+"""What may be skipped where all is installed: tests of images that are not here."""
 
 import re
 import subprocess
