@@ -34,7 +34,6 @@ pytestmark = pytest.mark.slow
 START = """
 import sys
 from pathlib import Path
-import pycolmap
 sys.argv = {argv!r}
 sys.path[:0] = [{folder!r}, {root!r}]
 import {module} as study
