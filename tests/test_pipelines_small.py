@@ -95,7 +95,7 @@ def test_every_script_has_a_test():
 def test_strips(tmp_path):
     change = """
 study.NUM_FRAMES, study.NUM_POINTS = 8, 500
-study.ALTITUDES, study.DISTANCES, study.MAX_ITERATIONS = (1.0,), (0.06,), 60
+study.ALTITUDES, study.DISTANCES, study.MAX_ITERATIONS = (0.5, 1.0), (0.06,), 60
 """
     run(
         "rsfm/strips.py",
@@ -103,7 +103,7 @@ study.ALTITUDES, study.DISTANCES, study.MAX_ITERATIONS = (1.0,), (0.06,), 60
         change=change,
     )
     rows = list(csv.DictReader((tmp_path / "strips.csv").open()))
-    assert len(rows) == 5  # methods
+    assert len(rows) == 10  # five methods at two altitudes
     assert (tmp_path / "strips.png").stat().st_size > 5_000
     assert "refractive, ports exact" in (tmp_path / "strips.md").read_text()
 
