@@ -166,7 +166,7 @@ def test_against_colmap(tmp_path):
 
 
 def test_one_camera():
-    text = run("bench/one_camera.py", change="study.SIZES = (4,)")
+    text = run("bench/one_camera.py", change="study.SIZES = (12,)")
     assert [number(row[1]) > 0.0 for row in table(text, "survey")] == [True, True]
 
 
