@@ -8,6 +8,14 @@ import pytest
 from result_folders import DiveResult, refined_dive
 
 from uwsfm.errors import MissingPackageError
+from uwsfm.first_run import compile_kernels
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what reconstructions need before the workers start: each would do so."""
+    workers = session.config.getoption("numprocesses", default=None)
+    if workers and not hasattr(session.config, "workerinput"):
+        compile_kernels(2)
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """A textured plane, rendered along exact water rays: what dense stereo is tested on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +9,7 @@ from sfm_scenes import model_of
 
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
+from uwsfm.geometry.rays import closest_points
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.refine_pipeline import refine_model
@@ -88,3 +89,24 @@ def dense_dive(folder: Path, num_frames: int = 3) -> DenseDive:
             # Lossless, whatever its name says: the model's names end in jpg.
             path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     return DenseDive(folder / "out", folder / "images", truth, plane)
+
+
+def range_errors(scene: Scene, amounts_m, xy: Array, ranges: Array) -> Array:
+    """By how much ranges (N,) along left pixels (N, 2) come out longer, if the ports of
+    the two cameras are farther away by two amounts than they were when the points were
+    seen."""
+    left, right = scene.cameras
+    pose = scene.cam_from_rig[1]
+    origins, dirs = left.ray_from_img(xy)
+    seen, _ = right.img_from_point(
+        rigid3.transform(pose, origins + ranges[:, None] * dirs)
+    )
+    left, right = (
+        camera.with_port(replace(camera.port, distance=camera.port.distance + amount))
+        for camera, amount in zip(scene.cameras, amounts_m, strict=True)
+    )
+    origins, dirs = left.ray_from_img(xy)
+    starts, ways = right.ray_from_img(seen)
+    back = rigid3.inverse(pose)
+    starts, ways = rigid3.transform(back, starts), rigid3.rotate(back, ways)
+    return closest_points(origins, dirs, starts, ways)[1][:, 0] - ranges

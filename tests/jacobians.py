@@ -5,7 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pycolmap
 
-from uwsfm import FlatPort
+from uwsfm import DomePort, FlatPort, NoPort
+from uwsfm.geometry import unit_vector
+from uwsfm.models.port import Port
 
 # Published calibrations: COLMAP's documentation (the first three), EuRoC cam0 (RADIAL
 # without its tangential terms; OPENCV, barrel), URIL's StereoPi (OPENCV, pincushion),
@@ -49,7 +51,7 @@ def tilted(degrees: float, azimuth: float) -> tuple[float, float, float]:
     )
 
 
-EXAMPLE_PORTS = {
+FLAT_PORTS = {
     "straight": FlatPort(),
     "paper": FlatPort(tilted(2, 40), 0.02, 0.03, 1.5, 1.333),
     "thin acrylic, near": FlatPort(tilted(20, 200), 1e-4, 1e-4, 1.49, 1.34),
@@ -58,6 +60,44 @@ EXAMPLE_PORTS = {
     "glass below water": FlatPort(tilted(8, 10), 0.03, 0.02, 1.2, 1.36),
     "air outside": FlatPort(tilted(3, 0), 0.03, 0.01, 1.5, 1.0, 1.333),
 }
+DOMES = {
+    "concentric": DomePort(),
+    "a hair off": DomePort((1e-9, 0.0, -2e-9)),
+    "forward": DomePort((0.0, 0.0, 0.01)),
+    "far off, thick": DomePort((0.01, -0.012, -0.03), 0.05, 0.02, 1.52, 1.334),
+    "vacuum's water": DomePort((0.004, 0.0, 0.02), 0.07, 0.0, 1.5, 1.36),
+    "filled with oil": DomePort((0.006, -0.004, 0.02), 0.06, 0.01, 1.6, 1.39, 1.3),
+}
+EXAMPLE_PORTS: dict[str, Port] = {**FLAT_PORTS, **DOMES, "none": NoPort()}
+"""Every kind of port, and every index other than one somewhere: a factor of n_air is
+one in every housing that is filled with air."""
+
+
+def _tilt(row: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    return np.concatenate([unit_vector.plus(row[:3], delta), row[3:]])
+
+
+def _add(slots: list[int]) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    return lambda row, delta: row + delta @ np.eye(len(row))[slots]
+
+
+def port_blocks(port: Port) -> list[tuple[slice | list[int], Callable, float]]:
+    """(columns, step of a port row, size of the differences) of each block of a port.
+
+    Columns count from the port's first one, in the order of
+    `uwsfm.models.projection.JAC_SIZE`: normal (2) and distance, or centre (3);
+    thickness, n_glass, n_water; radius. Lengths of a flat port may pass through zero:
+    its model is smooth there.
+    """
+    glass: list[tuple[slice | list[int], Callable, float]] = [
+        ([4], _add([6]), 1e-4),
+        ([5], _add([7]), 1e-4),
+    ]
+    if isinstance(port, DomePort):
+        centre = [(slice(0, 3), _add([0, 1, 2]), 1e-4)]
+        return [*centre, ([3], _add([4]), 1e-4), *glass, ([6], _add([3]), 1e-4)]
+    window = [(slice(0, 2), _tilt, 1e-4), ([2], _add([3]), 1e-5)]
+    return [*window, ([3], _add([4]), 1e-5), *glass]
 
 
 def central_differences(
@@ -85,6 +125,7 @@ def check_jacobian(
     *,
     step: float,
     rtol: float = 1e-6,
+    size: float = 0.0,
 ) -> None:
     """Compare ``jac`` (..., K) with central differences of ``fn`` through ``plus``.
 
@@ -95,7 +136,11 @@ def check_jacobian(
         jac: the Jacobian to check.
         step: of the differences, in units of delta.
         rtol: relative to the largest entry of the block.
+        size: of the numbers that ``fn`` is a difference of, where it is one: pixels.
     """
     numeric = central_differences(lambda delta: fn(plus(x, delta)), jac.shape[-1], step)
     scale = np.abs(numeric).max()
-    np.testing.assert_allclose(jac, numeric, rtol=0.0, atol=rtol * scale + 1e-9)
+    # The last digit of what is differenced, 4e-13 of pixels of 3000, over the step.
+    rounding = 4.0 * np.spacing(max(size, np.abs(fn(x)).max())) / step
+    atol = rtol * scale + max(rounding, 1e-9)
+    np.testing.assert_allclose(jac, numeric, rtol=0.0, atol=atol)

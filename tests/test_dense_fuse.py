@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dense_scenes import Plane
+from dense_scenes import Plane, range_errors
 
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.dense.calibration_error import CalibrationError
@@ -14,7 +14,6 @@ from uwsfm.dense.options import DenseOptions, bytes_of
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.rays import closest_points
 from uwsfm.residuals import border
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
@@ -76,6 +75,26 @@ def test_depth_maps_tell_their_noise_and_average_it(rng: np.random.Generator):
     assert np.median(fused.normals[:, 2]) < -0.99
 
 
+def test_errors_of_the_calibration_are_in_every_point_and_not_averaged(rng):
+    """Five maps share them: the noise becomes smaller, they stay, and both add up."""
+    plain = maps_of_floor(rng, 5)
+    shape = plain[0].distance.shape
+    # A deviation of its own for each pixel of the map that is fused.
+    systematic = np.linspace(0.003, 0.011, shape[0] * shape[1]).reshape(shape)
+    uncertain = replace(plain[0], calibration=systematic.astype(np.float32))
+    image = np.zeros((*shape, 3), dtype=np.uint8)
+    rule = {"min_views": 2, "keep_single": False}
+    without, _ = fuse(plain[0], plain[1:], image, NOISE_PX, **rule)
+    found, _ = fuse(uncertain, plain[1:], image, NOISE_PX, **rule)
+    np.testing.assert_array_equal(found.points, without.points)
+    # Which pixel a point is of: the one that it projects to.
+    pose = plain[0].cam_from_world
+    xy, _ = plain[0].camera.img_from_point(rigid3.transform(pose, found.points))
+    column, row = np.floor(xy).astype(int).T
+    expected = np.hypot(without.stddev, systematic[row, column])
+    np.testing.assert_allclose(found.stddev, expected, rtol=1e-5)  # single precision
+
+
 def test_what_others_contradict_is_dropped(rng: np.random.Generator):
     maps = maps_of_floor(rng, 4, bump=0.1)
     image = np.zeros((60, 80, 3), dtype=np.uint8)
@@ -122,8 +141,10 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         nearest = rows[np.argmin(fused.view_range[rows])]
         np.testing.assert_array_equal(cloud.colors[i], fused.colors[nearest])
         assert cloud.num_views[i] == fused.num_views[rows].max()
-        # Neighbours share their errors: no point is better than its parts.
-        assert cloud.stddev[i] >= fused.stddev[rows].min()
+        # Neighbours share their errors: the mean's deviation is the mean deviation,
+        # no smaller for being of many.
+        expected = np.average(fused.stddev[rows], weights=weight)
+        assert cloud.stddev[i] == pytest.approx(expected, rel=1e-9)
     with pytest.raises(InputError, match="choose a larger --voxel"):
         Voxels(1e-9, origin, 1e9).add(fused)
     few = Voxels(0.001, origin, 1e3)
@@ -132,7 +153,16 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         few.cloud()
 
 
-def test_an_uncertain_port_makes_the_depths_uncertain():
+OFF_BY = {
+    "one port": {(1, border.DISTANCE): 0.002},
+    "both alike": {(0, border.DISTANCE): 0.002, (1, border.DISTANCE): 0.002},
+    "both, opposite": {(0, border.DISTANCE): 0.002, (1, border.DISTANCE): -0.002},
+}
+"""Errors of port distances, metres, that come together or not at all."""
+
+
+@pytest.mark.parametrize("how", OFF_BY)
+def test_uncertain_ports_make_the_depths_uncertain(how):
     scene = simulate_scene(
         sample_rig(),
         rich_motion(4),
@@ -140,28 +170,19 @@ def test_an_uncertain_port_makes_the_depths_uncertain():
         ObservationOptions(num_points=60, noise_px=0.0),
     ).truth
     covariance = predict_covariance(scene, 0.5)
-    # Only the distance of the right port, by 2 mm.
-    column = covariance.border_cols[1, border.DISTANCE]
-    only = np.zeros_like(covariance.border)
-    only[column, column] = 0.002**2
+    error = np.zeros(len(covariance.border))
+    for (camera, slot), amount in OFF_BY[how].items():
+        error[covariance.border_cols[camera, slot]] = amount
+    only = np.outer(error, error)  # one error, in all of them at once
     found = CalibrationError(scene, replace(covariance, border=only), (0, 1), 1.0, 3.0)
-    left, right = scene.cameras
-    xy, ranges = np.array([[400.0, 300.0], [250.0, 200.0]]), np.array([1.5, 2.2])
-    pose = scene.cam_from_rig[1]
-    origins, dirs = left.ray_from_img(xy)
-    shown, _ = right.img_from_point(
-        rigid3.transform(pose, origins + ranges[:, None] * dirs)
-    )
-    port = replace(right.port, distance=right.port.distance + 0.002)
-    starts, ways = right.with_port(port).ray_from_img(shown)
-    back = rigid3.inverse(pose)
-    moved = closest_points(
-        origins, dirs, rigid3.transform(back, starts), rigid3.rotate(back, ways)
-    )[1][:, 0]
-    # Between the nodes of the grid, and to first order.
-    np.testing.assert_allclose(
-        found.stddev(xy, ranges), np.abs(moved - ranges), rtol=0.1, atol=1e-5
-    )
+    # Nodes of the grid: 8 by 6 steps between the outer pixels of 800 x 600, and three
+    # in the inverse range from 1 to 1/3.
+    xy = np.array([[400.0, 300.0], [0.5 + 799.0 / 4.0, 0.5 + 599.0 / 3.0]])
+    ranges = 1.0 / np.array([5.0 / 9.0, 7.0 / 9.0])
+    amounts = [OFF_BY[how].get((camera, border.DISTANCE), 0.0) for camera in (0, 1)]
+    expected = np.abs(range_errors(scene, amounts, xy, ranges))
+    # To first order: 2 mm of a port at 2 cm.
+    np.testing.assert_allclose(found.stddev(xy, ranges), expected, rtol=0.03)
 
 
 def test_depth_maps_come_back_or_are_made_again(tmp_path):

@@ -3,16 +3,20 @@
 import json
 import os
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from dense_scenes import DenseDive, dense_dive
+from dense_scenes import DenseDive, dense_dive, range_errors
 from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm.cli import app
 from uwsfm.dense import maps
+from uwsfm.dense.depth_map import DepthMap
 from uwsfm.errors import InputError, UwsfmError
+from uwsfm.residuals import border
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +60,28 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     assert np.sqrt(np.mean(height**2)) < 1.5 * np.median(cloud.stddev)
     assert np.median(np.abs(cloud.normals @ normal)) > 0.99
     assert np.all(cloud.num_views >= 2)
+
+
+def test_each_depth_has_the_deviation_of_its_own_pixel(dive_result):
+    """The right port is uncertain by 2 mm, and nothing else, over all of the image."""
+    result = uwsfm.open_result(dive_result.out)
+    scene, covariance = result.model.scene, result.calibration.covariance
+    column = covariance.border_cols[1, border.DISTANCE]
+    only = np.zeros_like(covariance.border)
+    only[column, column] = 0.002**2
+    uncertain = replace(result.calibration, covariance=replace(covariance, border=only))
+    depths = maps.DepthMaps(replace(result, calibration=uncertain), Path("images"))
+    depths.prepare_errors()
+    view = next(view for view in depths.views if view.key == (0, 1))
+    ranges = np.full((600, 800), 1.6, dtype=np.float32)
+    ranges[300:, :] = 2.1  # a step across the image
+    found = depths._calibration(view, DepthMap(ranges=ranges, sensitivity=ranges))
+    columns, rows = (n.ravel() for n in np.meshgrid([150, 400, 650], [120, 280, 470]))
+    xy = np.column_stack([columns, rows]) + 0.5
+    expected = range_errors(scene, (0.0, 0.002), xy, ranges[rows, columns])
+    # Between the nodes of a grid of 9 x 7 pixels and four ranges.
+    np.testing.assert_allclose(found[rows, columns], np.abs(expected), rtol=0.1)
+    assert np.ptp(expected) > 0.3 * np.abs(expected).max()  # no constant would do
 
 
 def _no_work(step: str, done: int, total: int) -> None:

@@ -152,8 +152,8 @@ def test_focal_length_water_and_radial_distortion_are_all_but_one():
     # Without distortion the radial term still tells, at two to three times the price.
     assert 2.0 < with_water / alone < 4.0
     assert 1.5 < distance_with_water / distance < 3.0
-    assert stddevs(**LENSES)[0] < 1.5 * alone
-    assert stddevs(**EVERYTHING)[0] > 30.0 * alone
+    assert 1.0 <= stddevs(**LENSES)[0] / alone < 1.5
+    assert 30.0 < stddevs(**EVERYTHING)[0] / alone < 300.0
     focal, distance = stddevs(**EVERYTHING, **KNOWN)
     assert focal < 1e-3 * 591.4 and distance < KNOWN["distance_stddev_m"]
 

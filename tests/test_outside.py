@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bounds import LEAST, MOST, assert_near_the_bound
 
 from uwsfm import Distances, InputError, Lengths, Positions, calibrate, verdicts
 from uwsfm.calibration.error_budget import with_budget
@@ -77,7 +78,8 @@ def test_scale_of_one_camera_comes_from_a_bar():
     )
     scale = align(found, true, np.ones(12), with_scale=True).scale
     stddev = result.covariance.scale_stddev
-    assert 1e-3 < stddev < 0.02 and abs(scale - 1.0) < 3.0 * stddev
+    assert abs(scale - 1.0) < 3.0 * stddev
+    assert_near_the_bound(result.covariance, simulated.truth, 0.5, lengths=lengths)
     assert abs(result.lengths.found_m[0] - result.lengths.given_m[0]) < 0.003
 
 
@@ -114,7 +116,16 @@ def test_known_housing_tells_the_scale_by_refraction(factor):
     )
     scale = align(found, true, np.ones(12), with_scale=True).scale
     stddev = result.covariance.scale_stddev
-    assert 0.02 < stddev < 0.2 and abs(scale - 1.0) < 3.0 * stddev
+    assert abs(scale - 1.0) < 3.0 * stddev
+    # A length that is known to 100 m leaves the scale to refraction, as it is here.
+    useless = Distances.from_arrays([[0, 11]], [0.88], [100.0])
+    assert_near_the_bound(
+        result.covariance,
+        simulated.truth,
+        0.5,
+        lengths=Lengths(between_frames=useless),
+        **HOUSING_KNOWN,
+    )
     assert any("from refraction alone" in s for s in verdicts(result, ["left"]))
 
 
@@ -167,7 +178,15 @@ def test_free_housing_leaves_the_scale_open():
     assert predict_covariance(simulated.truth, 0.5).scale_stddev is None
     known = Lengths(between_points=bar(simulated.truth))
     predicted = predict_covariance(simulated.truth, 0.5, lengths=known)
-    assert predicted.determined and 1e-3 < predicted.scale_stddev < 0.02
+    assert predicted.determined
+    # The images tell lengths against each other, the bar one of them: both add up.
+    exact = replace(known.between_points, stddevs_m=np.array([1e-7]))
+    of_images = predict_covariance(
+        simulated.truth, 0.5, lengths=Lengths(between_points=exact)
+    )
+    of_bar = known.between_points.stddevs_m[0] / known.between_points.lengths_m[0]
+    expected = np.hypot(of_images.scale_stddev, of_bar)
+    assert predicted.scale_stddev == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("rig", [paper_rig(), one_camera()], ids=["stereo", "mono"])
@@ -189,8 +208,15 @@ def test_positions_place_the_model_whatever_a_third_of_them_say(rig, rng):
     # the turn moves one against the other by less than a standard deviation.
     error = np.concatenate([turn, shift])
     assert error @ np.linalg.solve(fit.covariance, error) < 22.5  # 0.1 % of chi2_6
-    assert np.sqrt(fit.covariance[3, 3]) < NAV_STDDEV
-    assert result.covariance.scale_stddev < 0.02
+    # 24 positions less the third that is wrong tell where their mean is. The middle is
+    # their median, a metre or less beside it, which the turn moves.
+    along = np.sqrt(np.diag(fit.covariance)[3:])
+    best = NAV_STDDEV / np.sqrt(len(found) - len(wrong))
+    assert np.all((0.95 * best < along) & (along < 2.5 * best))
+    inliers = np.flatnonzero(fit.inliers)
+    used = Positions.from_arrays(inliers, found[inliers], np.full(3, NAV_STDDEV), ARM)
+    bound = predict_covariance(truth, 0.5, lengths=Lengths(positions=used))
+    assert LEAST < result.covariance.scale_stddev / bound.scale_stddev < MOST
 
 
 def scaled_start(scene):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from jacobians import EXAMPLE_CAMERAS, EXAMPLE_PORTS, check_jacobian, tilted
+from jacobians import EXAMPLE_CAMERAS, FLAT_PORTS, check_jacobian, tilted
 from naive import nearest_point
 
 from uwsfm import FlatPort, RefractiveCamera, Status
@@ -13,8 +13,8 @@ from uwsfm.residuals.point_3d import residual, residual_with_jac
 from uwsfm.solver.state import translation_arm
 
 # Every port once, in rigs of three cameras; and in pairs as the paper's.
-_NAMES = list(EXAMPLE_PORTS)
-PORTS = [EXAMPLE_PORTS[name] for name in _NAMES]
+_NAMES = list(FLAT_PORTS)
+PORTS = [FLAT_PORTS[name] for name in _NAMES]
 RIGS = [PORTS[0:3], PORTS[3:6], [PORTS[6], PORTS[0]], [PORTS[1], PORTS[1]]]
 IDS = ["+".join(name.split()[0] for name in _NAMES[a:b]) for a, b in ((0, 3), (3, 6))]
 IDS += ["air+straight", "paper pair"]

@@ -26,6 +26,9 @@ from uwsfm.sfm.same_frame import PairMatches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
 from uwsfm.trust.mistakes import shifted
 
+slow = pytest.mark.slow
+"""More of a kind, of which one is tested always."""
+
 
 @pytest.fixture(scope="module")
 def dive():
@@ -148,7 +151,10 @@ def test_a_lens_in_air_whose_port_is_missing_is_told(which, names):
     assert f"probably the port of {names} is missing in the rig file" in text
 
 
-@pytest.mark.parametrize("angle_deg", [8.0, 30.0, 90.0])
+@pytest.mark.parametrize(
+    "angle_deg",
+    [pytest.param(8.0, marks=slow), pytest.param(30.0, marks=slow), 90.0],
+)
 def test_a_wrong_rotation_of_lenses_calibrated_in_the_water_is_no_missing_port(
     rig, angle_deg
 ):
@@ -168,8 +174,19 @@ def without_ports(rig: Rig, which: tuple[int, ...]) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("angle_deg", [8.0, 30.0, 90.0])
+# Each axis and each angle once; every one with every other is slow.
+TURNS = [
+    pytest.param(
+        axis,
+        angle,
+        marks=() if (axis, angle) in ((0, 8.0), (1, 90.0), (2, 30.0)) else slow,
+    )
+    for axis in (0, 1, 2)
+    for angle in (8.0, 30.0, 90.0)
+]
+
+
+@pytest.mark.parametrize(("axis", "angle_deg"), TURNS)
 def test_a_wrong_rotation_is_refused(rig, pair, axis, angle_deg):
     poses = poses_of(rig)
     turn = np.zeros(6)

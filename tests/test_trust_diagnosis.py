@@ -167,11 +167,6 @@ FAST = (
         rig=with_pose(lambda p: np.r_[-p[:3], p[3:]], held=True),
     ),
     Mistake(
-        code="principal_point",
-        rig=with_params(moved(3, -75.0)),
-        number="222.2",
-    ),
-    Mistake(
         code="length_unit",
         rig=with_pose(lambda p: np.r_[p[:4], 25.0 * p[4:]]),
         number="and not 5 m",
@@ -191,6 +186,12 @@ FAST = (
     Mistake(code="distortion", rig=with_params(moved(4, 0.05)), number="for -0.00"),
 )
 SLOW = (
+    # Of one camera it is named always, below.
+    Mistake(
+        code="principal_point",
+        rig=with_params(moved(3, -75.0)),
+        number="222.2",
+    ),
     Mistake(
         code="held_port",
         rig=with_port_held("normal", (tilted_normal(6.0, 40.0), None)),

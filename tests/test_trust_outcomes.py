@@ -24,6 +24,13 @@ from outcomes import (  # noqa: E402
 )
 from wrong_inputs import MISTAKES  # noqa: E402
 
+# Some no observation shows; one takes 14 frames: six leave the ports at ± 18 mm.
+SHOWN = [
+    mistake
+    for mistake in MISTAKES
+    if not mistake.hidden and mistake.name != "baseline longer by half to three times"
+]
+
 
 @pytest.fixture(scope="module")
 def flat() -> Dive:
@@ -68,12 +75,8 @@ def test_a_lens_of_another_sign_does_not_fit_and_is_named(flat):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+@pytest.mark.parametrize("mistake", SHOWN, ids=lambda mistake: mistake.name)
 def test_no_mistake_is_confidently_wrong(flat, mistake):
-    if mistake.hidden:
-        pytest.skip("no observation shows it")
-    if mistake.name == "baseline longer by half to three times":
-        pytest.skip("six frames leave the ports at ± 18 mm: 14 frames show it")
     dive = flat
     if mistake.domes:
         dive = simulated_dive("small", num_frames=6, num_points=400, domes=True)

@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from jacobians import EXAMPLE_CAMERAS, EXAMPLE_PORTS, check_jacobian, tilted
+from jacobians import EXAMPLE_CAMERAS, FLAT_PORTS, check_jacobian, tilted
 from naive import least_time_dir, paper_virtual_error
 
 from uwsfm import FlatPort, RefractiveCamera, Status
@@ -16,7 +16,7 @@ SAGITTAL, TANGENTIAL = 0, 1
 SHEETS = pytest.mark.parametrize(
     "sheet", [SAGITTAL, TANGENTIAL], ids=["sagittal", "tangential"]
 )
-PORTS = pytest.mark.parametrize("port", EXAMPLE_PORTS.values(), ids=EXAMPLE_PORTS)
+PORTS = pytest.mark.parametrize("port", FLAT_PORTS.values(), ids=FLAT_PORTS)
 UNMOVED = rigid3.matrix_rows(rigid3.IDENTITY)
 
 
@@ -56,9 +56,9 @@ def test_equals_the_virtual_camera_of_the_paper(port, sheet, rng):
 
 
 @SHEETS
-@pytest.mark.parametrize("name", [name for name in EXAMPLE_PORTS if name != "no glass"])
+@pytest.mark.parametrize("name", [name for name in FLAT_PORTS if name != "no glass"])
 def test_is_zero_on_the_path_of_least_time(name, sheet, rng):
-    port = EXAMPLE_PORTS[name]  # the oracle divides by the length of every leg
+    port = FLAT_PORTS[name]  # the oracle divides by the length of every leg
     for _ in range(5):
         point = rng.uniform((-0.7, -0.7, 1.0), (0.7, 0.7, 3.0))
         air_dir = least_time_dir(
