@@ -384,6 +384,7 @@ class _Job:
         error = model.errors_px()[both]
         return {
             "num_frames": len(names),
+            "num_images": len(names) * len(model.rig.cameras),
             "unregistered_frames": unregistered,
             **found,
             "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},

@@ -99,6 +99,9 @@ def result_table(summary: dict[str, Any]) -> Table:
     rms = summary["reprojection_rms_px"]
     frames = f"{summary['num_registered_frames']} of {summary['num_frames']}"
     table.add_row("frames registered", frames)
+    if "num_images" in summary and len(summary["cameras"]) > 1:
+        images = f"{summary['num_registered_images']} of {summary['num_images']}"
+        table.add_row("images registered", images)
     table.add_row("points", f"{summary['num_points']}")
     table.add_row("observations", f"{summary['num_observations']}")
     table.add_row("invalid observations", f"{summary['num_invalid']}")

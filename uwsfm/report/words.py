@@ -51,12 +51,20 @@ def verdict_of(summary: dict[str, Any]) -> Conclusions:
         reasons=tuple((r["severity"], r["text"]) for r in summary.get("reasons", ())),
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
-        fit=f"{registered} of {frames} frames are registered, with {points} points "
+        fit=f"{registered} of {frames} frames are registered{_images(summary)}, with "
+        f"{points} points "
         f"seen in {count} observations. The adjustment brought their true reprojection "
         f"error from {rms['before']:.3g} to {rms['after']:.3g} px RMS.",
         ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
         open=tuple(_sentence(text) for text in summary["warnings"]),
     )
+
+
+def _images(summary: dict[str, Any]) -> str:
+    """How many images that is, where some are missing."""
+    if summary.get("num_registered_images") == summary.get("num_images"):
+        return ""
+    return f" ({summary['num_registered_images']} of {summary['num_images']} images)"
 
 
 def small_lengths(summary: dict[str, Any]) -> tuple[str, float]:

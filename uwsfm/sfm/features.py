@@ -71,7 +71,7 @@ def extract_images(
 ) -> None:
     """`extract_features` of some frames, which may have none."""
     threads = thread_count(num_threads)
-    total = len(frames.folders) * len(frames.names)
+    total = frames.num_images
     sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
     stopped = threading.Event()
 
@@ -155,7 +155,7 @@ def _missing(database: pycolmap.Database, frames: Frames) -> list[list[str]]:
     for begin in range(0, len(frames.names), CHUNK):
         for c in range(len(frames.folders)):
             block = range(begin, min(begin + CHUNK, len(frames.names)))
-            names = [frames.image_name(c, f) for f in block]
+            names = [frames.image_name(c, f) for f in block if frames.has_image(c, f)]
             chunks.append([name for name in names if name not in there])
     return [names for names in chunks if names]
 

@@ -23,7 +23,7 @@ from uwsfm._files import PARTIAL
 from uwsfm.errors import InputError
 from uwsfm.sfm.background import opened, run_with_database
 from uwsfm.sfm.colors import pixel_colors
-from uwsfm.sfm.images import read_color, size_fault
+from uwsfm.sfm.images import mask_path, read_color, size_fault
 from uwsfm.sfm.options import FeatureOptions
 
 
@@ -72,7 +72,7 @@ def find_features(
                 raise InputError(fault)
             cv2.imwrite(str(raw / f"{k}.pgm"), _gray(image, options))
             if options.mask_dir is not None:
-                shutil.copyfile(options.mask_dir / f"{name}.png", raw / f"{k}.pgm.png")
+                _copy_mask(options.mask_dir, name, size, raw / f"{k}.pgm.png")
             images.append(image)
         reader = pycolmap.ImageReaderOptions()
         if options.mask_dir is not None:
@@ -97,6 +97,15 @@ def find_features(
                 _features(database, ids[f"{k}.pgm"], image)
                 for k, image in enumerate(images)
             ]
+
+
+def _copy_mask(mask_dir: Path, name: str, size: tuple[int, int], target: Path) -> None:
+    """The mask of an image, white where it has none: COLMAP wants one for each."""
+    source = mask_path(mask_dir, name)
+    if source is not None:
+        shutil.copyfile(source, target)
+    else:
+        cv2.imwrite(str(target), np.full(size[::-1], 255, dtype=np.uint8))
 
 
 def _gray(image: Any, options: FeatureOptions) -> NDArray[np.uint8]:

@@ -80,7 +80,7 @@ def map_images(
                 cancellation_token=token,
             )
 
-    total = len(frames.names) * (len(frames.folders) if free else 1)
+    total = frames.num_images if free else len(frames.names)
     models = run_watched(call, lambda: progress("mapping", min(most, total), total))
     if not models:
         raise UwsfmError(_why_empty(mapping_path, frames))

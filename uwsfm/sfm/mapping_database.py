@@ -137,6 +137,8 @@ def _copy(
     source_id = {i.name: i.image_id for i in source.read_all_images()}
     for f in range(len(frames.names)):
         for c, (camera, pinhole) in enumerate(zip(cameras, pinholes, strict=True)):
+            if not frames.has_image(c, f):
+                continue
             name, image_id = frames.image_name(c, f), image_id_of(frames, c, f)
             old = source_id[name]
             xy = source.read_keypoints(old)[:, :2].astype(np.float64)

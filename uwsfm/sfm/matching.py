@@ -59,7 +59,7 @@ def image_pairs(
         for i, j in frame_pairs(len(frames.names), options, similar)
         for a in cameras
         for b in cameras
-        if i < j or a < b
+        if (i < j or a < b) and frames.has_image(a, i) and frames.has_image(b, j)
     ]
 
 
@@ -83,6 +83,7 @@ def chosen_pairs(
             lambda f: (
                 database.read_descriptors(ids[frames.image_name(c, f)]).data
                 for c in range(len(frames.folders))
+                if frames.has_image(c, f)
             ),
             num_frames,
             num_similar=options.num_similar,

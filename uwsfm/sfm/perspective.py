@@ -145,12 +145,14 @@ def read_start(start: PerspectiveStart) -> StartArrays:
         model = pycolmap.Reconstruction(start.model_path)
     except (RuntimeError, ValueError, MemoryError):
         raise damaged(start.model_path) from None
+    cameras = range(len(frames.folders))
     frame_of: dict[int, int] = {}  # index in `frames` -> COLMAP's frame id
     for frame_id in model.reg_frame_ids():
         ids = [data_id.id for data_id in model.frames[frame_id].image_ids]
-        if len(ids) != len(frames.folders):
+        frame = indices_of(frames, ids[0])[1]
+        if len(ids) != sum(frames.has_image(c, frame) for c in cameras):
             raise UwsfmError(f"frame {frame_id} of {start.model_path} lacks an image")
-        frame_of[indices_of(frames, ids[0])[1]] = frame_id
+        frame_of[frame] = frame_id
     registered = sorted(frame_of)
     index_of = {f: index for index, f in enumerate(registered)}
     # The virtual rig's frame is the reference camera's, moved to its virtual centre.
@@ -194,21 +196,25 @@ def _observation_table(
 def real_keypoints(
     features_path: Path, frames: Frames, registered: Sequence[int]
 ) -> tuple[tuple[Array, ...], ...]:
-    """[camera][frame] -> (n, 2) keypoints of some frames, from their database.
+    """[camera][frame] -> (n, 2) keypoints of some frames, from their database; none of
+    an image that is not there.
 
     Raises:
         UwsfmError: the database lacks an image.
     """
     with opened(features_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
+
+        def keypoints(c: int, f: int) -> Array:
+            if not frames.has_image(c, f):
+                return np.empty((0, 2))
+            stored = database.read_keypoints(ids[frames.image_name(c, f)])
+            return stored[:, :2].astype(np.float64)
+
         try:
-            wanted = [
-                [ids[frames.image_name(c, f)] for f in registered]
+            return tuple(
+                tuple(keypoints(c, f) for f in registered)
                 for c in range(len(frames.folders))
-            ]
+            )
         except KeyError:
             raise damaged(features_path) from None
-        return tuple(
-            tuple(database.read_keypoints(i)[:, :2].astype(np.float64) for i in camera)
-            for camera in wanted
-        )
