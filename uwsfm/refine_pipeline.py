@@ -120,7 +120,8 @@ def refine_model(
             without it they keep the colours of the model, and what only the database
             has is black.
         database: COLMAP's database of the model: tracks are made again from all its
-            matches, and frames that the model lacks are registered. It is not changed.
+            matches, and frames that the model lacks are registered; a model of poses
+            alone gets its points from it. It is not changed.
         scene_distance_m: Of a single camera's scene, about: without a baseline it sets
             the scale to start with; None: 1.
         positions, lever_arm, lengths, report: As in `reconstruct`.
@@ -147,13 +148,14 @@ def refine_model(
             "would replace: choose another folder"
         )
     clock = time.perf_counter()
-    start = start_from_model(found, rig, distance_m)
+    database = None if database is None else Path(database)
+    start = start_from_model(found, rig, distance_m, database)
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images, rig, start)
     matches, names = None, start.model.frame_names
     if database is not None:
-        matches = read_image_database(Path(database), start.model, rig)
+        matches = read_image_database(database, start.model, rig)
         names = matches.frame_names
     known = KnownLengths.read(lengths, positions, lever_arm)
     known.check_names(rig, names)

@@ -214,13 +214,16 @@ def _positions_summary(
         return None
     miss = np.linalg.norm(fit.misses_m, axis=1)
     turn, axis = fit.turn
-    place = np.sqrt(np.diag(fit.covariance)[3:])
+    place = np.sqrt(np.diag(fit.covariance)[3:]).tolist()
     return {
         "num_positions": len(fit.inliers),
         "outliers": [frame_names[f] for f in fit.frame_idx[~fit.inliers]],
         "rms_miss_m": float(np.sqrt(np.mean(miss[fit.inliers] ** 2))),
         "scatter": fit.scatter,
-        "place_stddev_m": place.tolist(),
+        "place_stddev_m": [
+            value if known else None
+            for value, known in zip(place, fit.measured, strict=True)
+        ],
         "turn_stddev_deg": math.degrees(turn),
         "turn_axis": axis.tolist(),
     }

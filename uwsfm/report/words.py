@@ -153,7 +153,9 @@ def position_words(summary: dict[str, Any]) -> str | None:
     if found is None:
         return None
     wrong = found["outliers"]
-    place = ", ".join(f"{value:.2g}" for value in found["place_stddev_m"])
+    place = ", ".join(
+        "-" if value is None else f"{value:.2g}" for value in found["place_stddev_m"]
+    )
     text = (
         f"{found['num_positions'] - len(wrong)} of {found['num_positions']} positions "
         f"are used; they miss the model by {found['rms_miss_m']:.3g} m RMS, "
