@@ -97,10 +97,8 @@ def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
         if in_text:
             table = _text_rows(path, size, count, kind)
         else:
-            order = "<" if lines[1] == _LITTLE else ">"
-            stored = np.fromfile(
-                path, dtype=kind.newbyteorder(order), count=count, offset=size
-            )
+            swapped = kind if lines[1] == _LITTLE else kind.newbyteorder(">")
+            stored = np.fromfile(path, dtype=swapped, count=count, offset=size)
             table = stored.astype(kind, copy=False)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
