@@ -42,7 +42,6 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
 from uwsfm.sfm.colors import point_colors
-from uwsfm.sfm.images import image_fault
 from uwsfm.sfm.model_database import (
     ImageDatabase,
     read_image_database,
@@ -50,6 +49,7 @@ from uwsfm.sfm.model_database import (
 )
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
+from uwsfm.sfm.pixels import image_fault
 from uwsfm.sfm.refine import (
     Refined,
     rig_options,

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwsfm._children import SAFE_PATH, import_path
-from uwsfm._files import PARTIAL
+from uwsfm._partial import partial_prefix
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
@@ -191,7 +191,7 @@ class Workers:
             self._folder.mkdir(parents=True, exist_ok=True)
         # In a workspace, what a killed run could not remove is gone with the next.
         scratch = processes.enter_context(
-            tempfile.TemporaryDirectory(prefix=PARTIAL, dir=self._folder)
+            tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=self._folder)
         )
         common: dict[str, Any] = {
             "n_workers": self.num_processes,

@@ -8,7 +8,6 @@ lives as long as the job.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm._files import PARTIAL
+from uwsfm._partial import scratch_folder
 from uwsfm.errors import InputError
 from uwsfm.sfm.background import opened, run_with_database
 from uwsfm.sfm.colors import pixel_colors
-from uwsfm.sfm.images import mask_path, read_color, size_fault
+from uwsfm.sfm.images import mask_path
 from uwsfm.sfm.options import FeatureOptions
+from uwsfm.sfm.pixels import read_color, size_fault
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +60,8 @@ def find_features(
     Raises:
         InputError: an image cannot be decoded, or has another size; names it.
     """
-    with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=work_dir) as folder:
-        raw, path = Path(folder) / "raw", Path(folder) / "features.db"
+    with scratch_folder(work_dir) as folder:
+        raw, path = folder / "raw", folder / "features.db"
         raw.mkdir()
         images = []
         for k, name in enumerate(names):

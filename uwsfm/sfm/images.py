@@ -1,4 +1,4 @@
-"""Which images belong together, and whether they can be read."""
+"""Which images belong together, and which masks they have."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
-import numpy as np
-
 from uwsfm._paths import check_image_names
 from uwsfm.errors import InputError
 from uwsfm.rig import Rig
+from uwsfm.sfm.pixels import read_gray, value_range
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 MIN_FRAMES = 2
@@ -204,6 +202,22 @@ def mask_warnings(frames: Frames, mask_dir: Path | None) -> list[str]:
     ]
 
 
+def range_warnings(frames: Frames) -> list[str]:
+    """A sentence on cameras whose images do not use the range of their pixels, by the
+    first image of each."""
+    found = {}
+    for folder in frames.folders:
+        names = (n for n in frames.image_names() if n.rpartition("/")[0] == folder)
+        words = value_range(frames.image_dir / next(names))
+        if words:
+            found[folder] = words
+    return [
+        f"the images of {folder}/ hold {words}: features and colours are taken from "
+        "their values scaled to the range that each image uses"
+        for folder, words in found.items()
+    ]
+
+
 def check_masks(frames: Frames, rig: Rig, mask_dir: Path) -> None:
     """Masks must have the size of their images; an image without one is used whole.
 
@@ -230,61 +244,3 @@ def check_masks(frames: Frames, rig: Rig, mask_dir: Path) -> None:
                 f"mask {path} has {mask.shape[1]} x {mask.shape[0]} pixels, but its "
                 f"image has {width} x {height}"
             )
-
-
-def image_fault(path: Path, size: tuple[int, int]) -> str | None:
-    """Why an image cannot be used by a camera of ``size`` (width, height), or None."""
-    return size_fault(path, read_gray(path), size)
-
-
-def size_fault(path: Path, image: Any, size: tuple[int, int]) -> str | None:
-    """`image_fault` of what was read from a file: rows, columns, or None."""
-    if image is None:
-        return f"image {path} cannot be read: it is not an image, or it is damaged"
-    height, width = image.shape[:2]
-    if (width, height) != size:
-        return (
-            f"image {path} has {width} x {height} pixels, but the intrinsics of its "
-            f"camera are for {size[0]} x {size[1]}"
-        )
-    return None
-
-
-def read_gray(path: Path) -> Any:
-    """An image (height, width) uint8 as stored, or None if it cannot be decoded.
-
-    The orientation tag is ignored, as by COLMAP: intrinsics belong to the sensor.
-    """
-    return _read(path, cv2.IMREAD_GRAYSCALE)
-
-
-def read_color(path: Path) -> Any:
-    """`read_gray` in blue, green and red: (height, width, 3)."""
-    return _read(path, cv2.IMREAD_COLOR)
-
-
-def _read(path: Path, flags: int) -> Any:
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-        if not _chunks_fit(data.data):
-            return None
-        return cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except (OSError, cv2.error):  # cv2.error: an empty file
-        return None
-
-
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-
-def _chunks_fit(data: memoryview) -> bool:
-    """Whether the parts of a PNG are as long as they claim; OpenCV takes the memory
-    for four gigabytes, and seconds, before it finds out."""
-    at = len(_PNG)
-    if data[:at] != _PNG:
-        return True
-    while at + 8 <= len(data):
-        kind = bytes(data[at + 4 : at + 8])
-        at += 12 + int.from_bytes(data[at : at + 4], "big")  # length, kind, checksum
-        if kind == b"IEND":
-            return at <= len(data)
-    return False

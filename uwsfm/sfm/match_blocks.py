@@ -9,7 +9,6 @@ matches of a pair do not depend on the block it is in.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm._files import PARTIAL
+from uwsfm._partial import scratch_folder
 from uwsfm.sfm.background import opened, run_with_database
 
 Pair = tuple[int, int]
@@ -88,10 +87,10 @@ def match_block(
         Matches for each pair, in the order of ``pairs``; none are verified.
     """
     report = watch or _nothing
-    with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=work_dir) as folder:
-        path = Path(folder) / "block.db"
+    with scratch_folder(work_dir) as folder:
+        path = folder / "block.db"
         _write_images(path, descriptors, {image for pair in pairs for image in pair})
-        list_path = Path(folder) / "pairs.txt"
+        list_path = folder / "pairs.txt"
         list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False

@@ -8,7 +8,6 @@ model.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from uwsfm._partial import scratch_folder
 from uwsfm.errors import InputError
 from uwsfm.sfm.background import opened, quiet_colmap
 
@@ -31,8 +31,8 @@ def copied_database(path: Path) -> Iterator[pycolmap.Database]:
     """
     if not path.is_file():
         raise InputError(f"database {path} does not exist")
-    with tempfile.TemporaryDirectory() as folder, quiet_colmap():
-        copy = Path(folder) / "database.db"
+    with scratch_folder() as folder, quiet_colmap():
+        copy = folder / "database.db"
         for suffix in ("", "-wal"):
             if Path(f"{path}{suffix}").is_file():
                 shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
@@ -57,8 +57,8 @@ def triangulated(
         InputError: there is no such database, it lacks an image of the model, or its
             verified matches make no point with these poses.
     """
-    with tempfile.TemporaryDirectory() as scratch, quiet_colmap():
-        path, out = Path(scratch) / "poses.db", Path(scratch) / "model"
+    with scratch_folder() as scratch, quiet_colmap():
+        path, out = scratch / "poses.db", scratch / "model"
         out.mkdir()
         with copied_database(database_path) as source, opened(path) as target:
             bare = _with_keypoints(model, folder, source)
@@ -74,9 +74,7 @@ def triangulated(
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1  # the same points in every run
         options.extract_colors = False
-        found = pycolmap.triangulate_points(
-            bare, path, Path(scratch), out, options=options
-        )
+        found = pycolmap.triangulate_points(bare, path, scratch, out, options=options)
     if found.num_points3D() == 0:
         raise InputError(
             f"{folder} has poses without points, and the matches of its database agree "

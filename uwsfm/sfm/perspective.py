@@ -116,8 +116,8 @@ def load_start(
     """
     try:
         content = json.loads((model_path / START_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise damaged(model_path / START_FILE) from None
+    except (OSError, ValueError) as error:
+        raise damaged(model_path / START_FILE, error) from None
     pinholes = []
     for entry in content["pinholes"]:
         entry["center_in_cam"] = np.array(entry["center_in_cam"])

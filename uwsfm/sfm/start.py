@@ -26,6 +26,7 @@ from uwsfm.sfm.images import (
     find_frames,
     mask_path,
     mask_warnings,
+    range_warnings,
 )
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
@@ -152,6 +153,7 @@ def start_from_matches(
         start = load_start(space.perspective, space.features, frames)
     start.summary["timings_s"] = steps.seconds()
     start.summary["warnings"] += mask_warnings(frames, options.features.mask_dir)
+    start.summary["warnings"] += range_warnings(frames)
     start.summary["steps_of_earlier_runs"] = steps.of_earlier_runs()
     return start
 
