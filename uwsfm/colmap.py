@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from uwsfm._checksums import check_checksums
+from uwsfm._disk import require_room
 from uwsfm.colmap_files import check_model_files, has_files, stray_track
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
@@ -85,6 +86,22 @@ def to_reconstruction(model: Model) -> pycolmap.Reconstruction:
         )
         reconstruction.points3D[point_id].error = float(errors[point])
     return reconstruction
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a COLMAP model in binary files.
+
+    Raises:
+        DiskFullError: there is no room for it: COLMAP would write a part and say
+            nothing.
+    """
+    keypoints = sum(len(image.points2D) for image in model.images.values())
+    records = 300 * (len(model.images) + len(model.cameras) + len(model.frames))
+    num_bytes = 24 * keypoints + 51 * len(model.points3D) + records
+    num_bytes += 8 * model.compute_num_observations()
+    require_room(folder, num_bytes, "writing the model")
+    model.write_binary(str(folder))
+    check_model_files(folder)
 
 
 def _mean_by_point(values: Array, scene: Scene) -> Array:

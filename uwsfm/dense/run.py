@@ -15,7 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uwsfm._disk import explained
 from uwsfm._files import require_writable
+from uwsfm._partial import remove_stale
 from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
@@ -72,7 +74,11 @@ def dense_cloud(
     settings = _parsed(options)
     result = open_result(out, images)
     source = result.require_images()
-    with job_log(result.folder, "uwsfm dense", asked, progress) as log:
+    remove_stale(result.folder, deep=True)
+    with (
+        explained(result.folder),
+        job_log(result.folder, "uwsfm dense", asked, progress) as log,
+    ):
         with _Run(result, source, settings, log.progress) as run:
             cloud = run.cloud()
         log.result(cloud.summary)

@@ -10,7 +10,7 @@ import numpy as np
 
 from uwsfm._files import checked_target, replaced_dir
 from uwsfm._progress import Progress, silent
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap import Model, to_reconstruction, write_model
 from uwsfm.errors import InputError
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
 from uwsfm.export.summary import write_json
@@ -70,7 +70,7 @@ def export_pinhole(
     with replaced_dir(target) as partial:
         sparse = partial / "sparse" / "0"
         sparse.mkdir(parents=True)
-        reconstruction.write_binary(str(sparse))
+        write_model(reconstruction, sparse)
         known = None
         if images is not None:
             known = _warp_all(

@@ -15,6 +15,7 @@ from zlib import error as BadCompression
 
 import pycolmap
 
+from uwsfm._disk import is_full
 from uwsfm.errors import UwsfmError
 
 Result = TypeVar("Result")
@@ -47,7 +48,9 @@ def opened(database_path: Path) -> Iterator[pycolmap.Database]:
     with quiet_colmap():
         try:
             database = pycolmap.Database.open(database_path)
-        except RuntimeError:
+        except RuntimeError as error:
+            if is_full(error):
+                raise
             raise damaged(database_path) from None
         with database:
             yield database

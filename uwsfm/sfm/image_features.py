@@ -39,6 +39,22 @@ class ImageFeatures:
     """(N, 3) RGB of the pixel that holds the keypoint."""
 
 
+FEATURE_BYTES = 128 + 24 + 3
+"""A descriptor, a keypoint and its colour."""
+
+
+def scratch_bytes(
+    size: tuple[int, int], num_images: int, options: FeatureOptions
+) -> float:
+    """Room that `find_features` may take for a while, in bytes.
+
+    The images in grey, their masks, and a database with its journal.
+    """
+    num_features = options.num_features(*size)
+    pixels = size[0] * size[1] * (1 if options.mask_dir is None else 2)
+    return num_images * (pixels + 2 * num_features * FEATURE_BYTES)
+
+
 def find_features(
     image_dir: Path,
     names: Sequence[str],

@@ -68,6 +68,13 @@ def pair_blocks(
     return blocks
 
 
+def scratch_bytes(descriptors: Mapping[int, Descriptors], num_pairs: int) -> float:
+    """Room that `match_block` may take for a while, in bytes: a database with its
+    journal, and what all features of an image would match."""
+    rows = [len(of_image) for of_image in descriptors.values()]
+    return 2.0 * 136 * sum(rows) + 8.0 * num_pairs * max(rows, default=0)
+
+
 def match_block(
     descriptors: Mapping[int, Descriptors],
     pairs: Sequence[Pair],

@@ -12,11 +12,18 @@ from pathlib import Path
 
 import pycolmap
 
+from uwsfm._disk import require_room
 from uwsfm._progress import Progress, silent
 from uwsfm.sfm import background
 from uwsfm.sfm.background import opened, quiet_colmap
 from uwsfm.sfm.images import Frames
-from uwsfm.sfm.match_blocks import Matches, Pair, match_block, pair_blocks
+from uwsfm.sfm.match_blocks import (
+    Matches,
+    Pair,
+    match_block,
+    pair_blocks,
+    scratch_bytes,
+)
 from uwsfm.sfm.options import MatchOptions, thread_count
 from uwsfm.sfm.paper_matching import match_pairs
 from uwsfm.sfm.retrieval import similar_frames
@@ -166,6 +173,9 @@ def _match_with_colmap(
             used = {image for pair in blocks[k] for image in pair}
             with access:
                 descriptors = {i: database.read_descriptors(i).data for i in used}
+            # Every thread may ask before any of them has written.
+            needed = num_threads * scratch_bytes(descriptors, len(blocks[k]))
+            require_room(database_path.parent, needed, "matching")
             return match_block(descriptors, blocks[k], database_path.parent, watch)
 
         access = threading.Lock()  # to the connection, which is not for two threads

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from uwsfm._disk import require_room
 from uwsfm._files import replaced_file
 from uwsfm._partial import scratch_folder
 from uwsfm._progress import Progress, silent
@@ -22,7 +23,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.background import DAMAGE, damaged, opened, remove_database
 from uwsfm.sfm.features import COLORS, extract_images, require_features
 from uwsfm.sfm.images import Frames
-from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks
+from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks, scratch_bytes
 from uwsfm.sfm.matching import chosen_pairs
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 from uwsfm.sfm.steps import fingerprint
@@ -169,6 +170,7 @@ def match_task(folder: Path, block: Sequence[Pair], path: Path) -> None:
         for image in sorted({image for pair in block for image in pair})
     }
     with scratch_folder() as own:
+        require_room(own, scratch_bytes(descriptors, len(block)), "matching")
         found = match_block(descriptors, block, own)
     with replaced_file(path) as partial, partial.open("wb") as file:
         np.savez(file, *found)

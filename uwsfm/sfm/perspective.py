@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from uwsfm._files import replaced_dir
+from uwsfm.colmap import write_model
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -101,7 +102,7 @@ def write_start(
         "summary": summary,
     }
     with replaced_dir(model_path) as partial:
-        model.write(partial)
+        write_model(model, partial)
         text = json.dumps(content, indent=1)
         (partial / START_FILE).write_text(text, encoding="utf-8")
 
