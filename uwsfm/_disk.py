@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from uwsfm._partial import PARTIAL
 from uwsfm.errors import UwsfmError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -71,8 +72,11 @@ def require_room(folder: Path, num_bytes: float, what: str) -> None:
     """
     there, needed = room(folder), num_bytes + SPARE_BYTES
     if there < needed:
+        above = [folder, *folder.parents]
+        partial = [path for path in above if path.name.startswith(PARTIAL)]
+        where = partial[-1].parent if partial else folder
         raise DiskFullError(
-            f"the disk of {folder} is full: {what} takes {_megabytes(needed)} more, "
+            f"the disk of {where} is full: {what} takes {_megabytes(needed)} more, "
             f"{_megabytes(there)} are free; make room and run the same command again, "
             "which goes on from here"
         )

@@ -13,7 +13,7 @@ import os
 import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,6 +25,7 @@ from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+    from distributed.security import Security
 
 Result = TypeVar("Result")
 
@@ -180,10 +181,13 @@ class Workers:
         """A cluster of processes of one thread each, which end with the stack.
 
         They are started by command line: a process that is spawned from here would run
-        the caller's script again. If this one is killed, they end by themselves.
+        the caller's script again. If this one is killed, they end by themselves. Who
+        can reach a scheduler can run code as its user: all of them speak TLS, with keys
+        that nobody else has, and none serves a page.
         """
         import dask
         from distributed import Client, LocalCluster, SubprocessCluster
+        from distributed.security import Security
 
         _log_as_all_do()
         logger.info("starting %d worker processes", self.num_processes)
@@ -193,7 +197,9 @@ class Workers:
         scratch = processes.enter_context(
             tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=self._folder)
         )
+        security = Security.temporary()
         common: dict[str, Any] = {
+            "security": security,
             "n_workers": self.num_processes,
             "threads_per_worker": 1,
             "dashboard_address": None,
@@ -201,17 +207,24 @@ class Workers:
         }
         each: dict[str, Any] = {
             "local_directory": scratch,
+            "dashboard": False,
             "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
         }
         preload = [ENDS_WITH_PARENT.format(parent=os.getpid(), path=import_path())]
-        with _careful_starts(), dask.config.set({"temporary-directory": scratch}):
+        with (
+            _careful_starts(_secrets(security)),
+            dask.config.set({"temporary-directory": scratch}),
+        ):
             if sys.platform == "win32":  # where processes can only be spawned
-                cluster = LocalCluster(**common, **each)
+                cluster = LocalCluster(**common, **each, protocol="tls://")
             else:
                 cluster = SubprocessCluster(
                     **common,
                     worker_kwargs={**each, "preload_nanny": preload},
                     scheduler_kwargs={
+                        "protocol": "tls://",
+                        "dashboard": False,
+                        "dashboard_address": "127.0.0.1:0",  # an empty page
                         "preload": preload,
                         "local_directory": scratch,
                         # Dask removes it at its end, if it gets there: our folder is.
@@ -350,11 +363,33 @@ def _sees(path: str) -> bool:
     return os.path.exists(path)
 
 
+def _secrets(security: Security) -> dict[str, str]:
+    """Keys and certificates as environment variables that Dask reads, and no pages.
+
+    Command lines are seen by all users of a machine, environments by their own only;
+    and on the disk there is no key.
+    """
+    comm, http = "DASK_DISTRIBUTED__COMM__", "HTTP__ROUTES"
+    found = {f"{comm}REQUIRE_ENCRYPTION": "True"}
+    found[f"{comm}TLS__CA_FILE"] = security.tls_ca_file
+    for role in ("client", "scheduler", "worker"):
+        for what in ("key", "cert"):
+            value = getattr(security, f"tls_{role}_{what}")
+            found[f"{comm}TLS__{role.upper()}__{what.upper()}"] = value
+    for role in ("SCHEDULER", "WORKER"):
+        found[f"DASK_DISTRIBUTED__{role}__{http}"] = "[]"
+    return found
+
+
 @contextmanager
-def _careful_starts() -> Iterator[None]:
-    """Processes that are started tell errors only, from their first line on, and
-    import nothing from the working folder."""
-    wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1"}
+def _careful_starts(secrets: Mapping[str, str]) -> Iterator[None]:
+    """Processes that are started tell errors only, from their first line on, import
+    nothing from the working folder, and know secrets of this one.
+
+    Args:
+        secrets: environment variables, see `_secrets`.
+    """
+    wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1", **secrets}
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
