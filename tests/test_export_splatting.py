@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from command_line import one_sentence, run
 from sfm_scenes import model_of
 from test_export_pinhole import simulated, write_images
 
@@ -219,3 +220,12 @@ def test_images_of_another_size_leave_nothing(export, tmp_path):
     with pytest.raises(InputError, match="is 40 x 40, but its camera takes"):
         export_pinhole(model, tmp_path / "o", tmp_path / "images", flat_names=True)
     assert not (tmp_path / "o").exists()
+
+
+def test_the_command_line_asks_for_the_images_that_trainers_need(tmp_path):
+    (tmp_path / "out").mkdir()
+    base = ("export", "out", "-o", "target", "--to")
+    one_sentence(run(*base, "splatting", cwd=tmp_path), "--images")
+    one_sentence(
+        run(*base, "ply", "--flat-names", cwd=tmp_path), "--to ply writes no images"
+    )
