@@ -93,7 +93,7 @@ def test_a_model_of_poses_is_refined_like_the_whole_one(dive, whole, tmp_path):
 @pytest.mark.parametrize(
     ("mistake", "words"),
     [
-        ("no database", "give COLMAP's database with --database"),
+        ("no database", r"its database to uwsfm refine \(--database\)"),
         ("other images", "the database has no image left/0000.jpg"),
         ("other poses", "agree with no point at these poses"),
         ("not matched", "no verified matches between their images"),
@@ -179,7 +179,7 @@ def test_the_case_without_points_gives_those_of_the_good_one(tmp_path):
     [
         ("track_to_removed_image", r"points3D.txt: line \d+: point \d+ is seen by"),
         ("right_as_png", "0001.jpg and 0001.png differ by their suffix only"),
-        ("no_points", "give COLMAP's database with --database"),
+        ("no_points", r"its database to uwsfm refine \(--database\)"),
     ],
 )
 def test_cases_that_stay_refused_name_their_cause(tmp_path, name, words):

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwsfm._children import SAFE_PATH, import_path
+from uwsfm._cluster_keys import secrets_of
 from uwsfm._partial import partial_prefix
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
 if TYPE_CHECKING:
     from distributed import Client, Future
-    from distributed.security import Security
 
 Result = TypeVar("Result")
 
@@ -212,7 +212,7 @@ class Workers:
         }
         preload = [ENDS_WITH_PARENT.format(parent=os.getpid(), path=import_path())]
         with (
-            _careful_starts(_secrets(security)),
+            _careful_starts(secrets_of(security)),
             dask.config.set({"temporary-directory": scratch}),
         ):
             if sys.platform == "win32":  # where processes can only be spawned
@@ -363,31 +363,13 @@ def _sees(path: str) -> bool:
     return os.path.exists(path)
 
 
-def _secrets(security: Security) -> dict[str, str]:
-    """Keys and certificates as environment variables that Dask reads, and no pages.
-
-    Command lines are seen by all users of a machine, environments by their own only;
-    and on the disk there is no key.
-    """
-    comm, http = "DASK_DISTRIBUTED__COMM__", "HTTP__ROUTES"
-    found = {f"{comm}REQUIRE_ENCRYPTION": "True"}
-    found[f"{comm}TLS__CA_FILE"] = security.tls_ca_file
-    for role in ("client", "scheduler", "worker"):
-        for what in ("key", "cert"):
-            value = getattr(security, f"tls_{role}_{what}")
-            found[f"{comm}TLS__{role.upper()}__{what.upper()}"] = value
-    for role in ("SCHEDULER", "WORKER"):
-        found[f"DASK_DISTRIBUTED__{role}__{http}"] = "[]"
-    return found
-
-
 @contextmanager
 def _careful_starts(secrets: Mapping[str, str]) -> Iterator[None]:
     """Processes that are started tell errors only, from their first line on, import
     nothing from the working folder, and know secrets of this one.
 
     Args:
-        secrets: environment variables, see `_secrets`.
+        secrets: environment variables, see `secrets_of`.
     """
     wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1", **secrets}
     before = {name: os.environ.get(name) for name in wanted}

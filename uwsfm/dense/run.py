@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from uwsfm._disk import explained
+from uwsfm._disk import explained, require_room
 from uwsfm._files import require_writable
 from uwsfm._partial import remove_stale
 from uwsfm._progress import Progress, silent
@@ -122,6 +122,7 @@ class _Run:
 
         Raises:
             InputError: one sentence.
+            DiskFullError: there is no room for the depth maps.
         """
         count, wanted = len(self.views), self.options.min_views
         if wanted > (max(count, 2) if self.options.keep_single else count):
@@ -135,6 +136,8 @@ class _Run:
             )
         require_writable(self.result.folder / DENSE_CLOUD)
         self.maps.require_images()
+        needed = self.maps.missing_bytes()
+        require_room(self.result.folder, needed, "making depth maps")
 
     def cloud(self) -> DenseResult:
         self.check()

@@ -172,7 +172,7 @@ def read_image_model(
     if not len(table):
         raise InputError(
             f"{folder}: the model has poses, but no points that its images see: give "
-            "COLMAP's database with --database, or make points with its "
+            "its database to uwsfm refine (--database), or make points with COLMAP's "
             "point_triangulator"
         )
     if not np.isfinite(table[:, 6]).any():
