@@ -62,9 +62,10 @@ def verdict_of(summary: dict[str, Any]) -> Conclusions:
 
 def _images(summary: dict[str, Any]) -> str:
     """How many images that is, where some are missing."""
-    if summary.get("num_registered_images") == summary.get("num_images"):
+    total = summary.get("num_images")  # none in results of earlier versions
+    if total is None or summary["num_registered_images"] == total:
         return ""
-    return f" ({summary['num_registered_images']} of {summary['num_images']} images)"
+    return f" ({summary['num_registered_images']} of {total} images)"
 
 
 def small_lengths(summary: dict[str, Any]) -> tuple[str, float]:
