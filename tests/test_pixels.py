@@ -100,6 +100,20 @@ def test_a_few_bytes_before_the_end_of_a_jpeg_are_no_damage(tmp_path):
             )
 
 
+def test_a_png_with_damaged_pixels_is_refused_and_one_with_other_notes_is_not(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), (255 * RAMP).astype(np.uint8))
+    whole = (tmp_path / "a.png").read_bytes()
+    at = whole.index(b"IDAT") + 40
+    harmed = whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :]
+    (tmp_path / "a.png").write_bytes(harmed)
+    assert "or it is damaged" in image_fault(tmp_path / "a.png", (80, 60))
+    # A text chunk with a wrong checksum: libpng leaves it out.
+    note = b"\0\0\0\4tEXtA\0bc\1\2\3\4"
+    at = whole.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(whole[:at] + note + whole[at:])
+    assert image_fault(tmp_path / "a.png", (80, 60)) is None
+
+
 def test_a_file_that_cannot_be_looked_at_is_not_called_damaged(tmp_path):
     loop = tmp_path / "a.jpg"
     loop.symlink_to(loop)

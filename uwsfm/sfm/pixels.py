@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,11 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 _KEEP = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 _PNG = b"\x89PNG\r\n\x1a\n"
+_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"IDAT")
 _JPEG = b"\xff\xd8\xff"
 _EXTRA_BYTES = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
+NO_DAMAGE = ("Unsupported color", "Unsupported JPEG process")
+"""What libjpeg says of whole images of kinds that it does not turn into grey."""
 MAX_EXTRA_BYTES = 16
 """Before the end of a JPEG: some cameras leave a few, behind the whole image."""
 
@@ -117,29 +121,42 @@ def value_range(path: Path) -> str:
 
 def _jpeg_fault(data: np.ndarray) -> str | None:
     """What libjpeg has to say of the data of a JPEG that it decodes all the same."""
-    content = data.data
-    if bytes(content[: len(_JPEG)]) != _JPEG:
+    content = data.tobytes()
+    if not content.startswith(_JPEG):
         return None
+    words = _strict_words(content)
+    extra = _EXTRA_BYTES.search(words)
+    if extra is not None and int(extra[1]) <= MAX_EXTRA_BYTES:
+        end = content.rfind(b"\xff\xd9")  # without them, nothing else may be wrong
+        words = _strict_words(content[: end - int(extra[1])] + content[end:])
+    return words or None
+
+
+def _strict_words(content: bytes) -> str:
+    """Of libjpeg, of what is not right in a JPEG; ''."""
     try:
         simplejpeg.decode_jpeg(content, "GRAY", strict=True)
     except ValueError as error:
         words = str(error)
-        extra = _EXTRA_BYTES.search(words)
-        harmless = extra is not None and int(extra[1]) <= MAX_EXTRA_BYTES
-        damage = words.startswith(("Corrupt JPEG data", "Premature end"))
-        return words if damage and not harmless else None
-    return None
+        return "" if words.startswith(NO_DAMAGE) else words
+    return ""
 
 
 def _chunks_fit(data: memoryview) -> bool:
-    """Whether the parts of a PNG are as long as they claim; OpenCV takes the memory
-    for four gigabytes, and seconds, before it finds out."""
+    """Whether the parts of a PNG are as long as they claim, and those of its pixels
+    whole; OpenCV takes the memory for four gigabytes, and seconds, before it finds out,
+    and fills up what is damaged."""
     at = len(_PNG)
     if data[:at] != _PNG:
         return True
     while at + 8 <= len(data):
         kind = bytes(data[at + 4 : at + 8])
+        start = at + 4
         at += 12 + int.from_bytes(data[at : at + 4], "big")  # length, kind, checksum
+        if kind in _PIXEL_CHUNKS and at <= len(data):
+            expected = int.from_bytes(data[at - 4 : at], "big")
+            if zlib.crc32(data[start : at - 4]) != expected:
+                return False
         if kind == b"IEND":
             return at <= len(data)
     return False
