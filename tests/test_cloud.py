@@ -5,7 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm.cloud import Cloud, read_cloud, unit_of_cloud, write_cloud
+from uwsfm.cloud import (
+    Cloud,
+    read_cloud,
+    read_table,
+    unit_of_cloud,
+    write_cloud,
+)
 from uwsfm.errors import InputError
 
 
@@ -48,6 +54,42 @@ def _header(*lines: str) -> bytes:
     return "\n".join(head).encode()
 
 
+def _ascii(*lines: str) -> bytes:
+    return _header(*lines).replace(b"binary_little_endian", b"ascii")
+
+
+COLUMNS = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("red", "u1"), ("views", "<i4")]
+ROWS = [(400000.125, -2.5, 3.0, 255, -7), (1.0, 0.25, 1e-3, 0, 70000)]
+PROPERTIES = ("double x", "double y", "double z", "uchar red", "int views")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_big_endian", "binary_little_endian"])
+def test_every_kind_of_ply_gives_the_same_numbers(tmp_path, kind, end, open3d):
+    """Two rows written by hand, and after them a face that is no vertex."""
+    lines = ["ply", f"format {kind} 1.0", "comment unit: metre", "element vertex 2"]
+    lines += [f"property {name}" for name in PROPERTIES]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    head = "".join(line + end for line in lines).encode()
+    table = np.array(ROWS, dtype=COLUMNS)
+    if kind == "ascii":
+        body = "".join(" ".join(map(str, row)) + end for row in ROWS).encode()
+        body += f"3 0 1 0{end}".encode()
+    else:
+        order = "<" if "little" in kind else ">"
+        body = table.astype(table.dtype.newbyteorder(order)).tobytes()
+        body += b"\x03" + np.array([0, 1, 0], dtype=f"{order}i4").tobytes()
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(head + body)
+    found = read_table(path)
+    assert found.dtype == table.dtype
+    np.testing.assert_array_equal(found, table)
+    assert unit_of_cloud(path) == "metre"
+    if end == "\n":  # as Open3D reads it
+        points = open3d.t.io.read_point_cloud(str(path)).point["positions"].numpy()
+        np.testing.assert_array_equal(read_cloud(path).points, points)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -72,7 +114,20 @@ def _header(*lines: str) -> bytes:
         (_header(), "without vertices"),
         (b"ply\nformat binary_little_endian 1.0\n", "no end_header within"),
         (b"solid\n", "not a PLY file"),
-        (b"ply\nformat ascii 1.0\nend_header\n", "little-endian"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "without vertices"),
+        (b"ply\nformat text 1.0\nend_header\n", "got 'format text 1.0'"),
+        (
+            _ascii("element vertex 2", "property float x") + b"1\n",
+            "holds 1 of its 2 vertices",
+        ),
+        (
+            _ascii("element vertex 2", "property float x") + b"1\nnorth\n",
+            "a vertex is no row of numbers",
+        ),
+        (
+            _ascii("element vertex 1", "property uchar red") + b"256\n",
+            "red of a vertex is no integer from 0 to 255",
+        ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
             b"property float x\nend_header\n0000",

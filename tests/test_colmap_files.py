@@ -6,6 +6,8 @@ import struct
 import subprocess
 import sys
 
+import numpy as np
+import pycolmap
 import pytest
 from command_line import one_sentence
 from hostile import CASES, copied, needs_cases, small_model, written
@@ -185,3 +187,26 @@ def test_an_empty_file_is_refused_within_a_second_of_work(tmp_path):
         check=False,
     )
     one_sentence(found, str(folder))
+
+
+def test_text_files_beside_binary_ones_must_be_of_the_same_state(tmp_path):
+    """Both formats of one model, as COLMAP's GUI leaves them; then either is newer."""
+    model = small_model()
+    folder = written(model, tmp_path / "model")
+    model.write_text(str(folder))
+    assert read_reconstruction(folder).num_images() == model.num_images()
+    path = folder / "images.txt"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("left/0001.jpg", "left/9.jpg"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"differ \(image left/0001.jpg\): remove"):
+        read_reconstruction(folder)
+    path.write_text(text, encoding="utf-8")
+    model.transform(pycolmap.Sim3d(1.01, pycolmap.Rotation3d(), np.zeros(3)))
+    model.write_text(str(folder))
+    with pytest.raises(InputError, match=r"differ \(image left/"):
+        read_reconstruction(folder)
+    for point_id in sorted(model.points3D)[:3]:
+        model.delete_point3D(point_id)
+    model.write_text(str(folder))
+    with pytest.raises(InputError, match="10 points3D in the binary files, 7 in the"):
+        read_reconstruction(folder)

@@ -12,10 +12,12 @@ from dense_scenes import DenseDive, dense_dive, range_errors
 from typer.testing import CliRunner
 
 import uwsfm
+from uwsfm._disk import DiskFullError
 from uwsfm.cli import app
 from uwsfm.dense import maps
 from uwsfm.dense.depth_map import DepthMap
 from uwsfm.errors import InputError, UwsfmError
+from uwsfm.export.files import WORK
 from uwsfm.residuals import border
 
 
@@ -41,6 +43,7 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         uwsfm.dense_cloud(dive.out, dive.images, num_threads=1)
     assert len(made) == 2 and not (dive.out / "dense").exists()
+    _room_is_asked_for(dive, monkeypatch)
     # The same command goes on: the first two are kept.
     stopped_at(3)
     done = CliRunner().invoke(
@@ -82,6 +85,21 @@ def test_each_depth_has_the_deviation_of_its_own_pixel(dive_result):
     # Between the nodes of a grid of 9 x 7 pixels and four ranges.
     np.testing.assert_allclose(found[rows, columns], np.abs(expected), rtol=0.1)
     assert np.ptp(expected) > 0.3 * np.abs(expected).max()  # no constant would do
+
+
+def _room_is_asked_for(dive: DenseDive, monkeypatch) -> None:
+    """Two depth maps are there: the others are as large."""
+    there = list((dive.out / WORK / maps.FOLDER).glob("*.npz"))
+    assert len(there) == 2
+    asked = maps.DepthMaps(uwsfm.open_result(dive.out, dive.images), dive.images)
+    missing = len(asked.views) - len(there)
+    size = np.mean([path.stat().st_size for path in there])
+    # Names, shapes and the key take less than two kilobytes.
+    assert 0 <= missing * size - asked.missing_bytes() < 2000 * missing
+    with monkeypatch.context() as patch:
+        patch.setattr("uwsfm._disk.room", lambda folder: 1_000_000)
+        with pytest.raises(DiskFullError, match="making depth maps takes"):
+            uwsfm.dense_cloud(dive.out, dive.images, progress=_no_work)
 
 
 def _no_work(step: str, done: int, total: int) -> None:

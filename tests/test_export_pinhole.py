@@ -207,7 +207,8 @@ def test_folder_holds_what_dense_tools_expect(exact, tmp_path):
     virtual = found.model.scene.xy[rows]
     name = model.image_name(c, f)
     warped = cv2.imread(str(tmp_path / "out" / "images" / name), cv2.IMREAD_UNCHANGED)
-    inner = np.all((virtual > 20) & (virtual < np.array(warped.shape[::-1]) - 20), 1)
+    size = model.rig.cameras[c].camera.width, model.rig.cameras[c].camera.height
+    inner = np.all((real > 20) & (real < np.array(size) - 20), axis=1)
     at = virtual[inner, ::-1].T - 0.5
     shown = map_coordinates(warped.astype(np.float64), at, order=1) / 64
     # What OpenCV's Lanczos resampling makes of a ramp, and steps of 1/64 px.

@@ -83,6 +83,22 @@ def test_open3d_reads_points_and_lines(model, tmp_path, open3d):
     np.testing.assert_array_equal(np.asarray(lines.lines), edges)
 
 
+def test_trimesh_reads_it_as_colours_of_edges_are_left_out(model, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    export_scene_ply(model, tmp_path / "scene.ply")
+    found = read_ply(tmp_path / "scene.ply")
+    assert found["edge"].dtype.names == ("vertex1", "vertex2")
+    cloud = trimesh.load(tmp_path / "scene.ply")
+    xyz = np.stack([found["vertex"][axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(np.asarray(cloud.vertices), xyz)
+    export_scene_ply(model, tmp_path / "colours.ply", edge_colors=True)
+    edges = read_ply(tmp_path / "colours.ply")["edge"]
+    assert edges.dtype.names == ("vertex1", "vertex2", "red", "green", "blue")
+    assert {tuple(row) for row in edges[["red", "green", "blue"]].tolist()} > {
+        (255, 255, 255)
+    }
+
+
 def test_never_over_a_file(model, tmp_path):
     (tmp_path / "scene.ply").write_text("mine")
     with pytest.raises(uwsfm.InputError, match=r"scene.ply exists already"):

@@ -212,7 +212,7 @@ def test_a_bar_that_contradicts_the_baseline_is_told(tmp_path, rng):
 
 
 CSV_PROBLEMS = {
-    "": "header must be frame,x,y,z,sx,sy,sz, got ''",
+    "": "must be frame,x,y,z,sx,sy,sz, or frame,depth,sdepth where only depths",
     "a.jpg,1,2,3,1,1,1\n": "header must be",
     "frame,lat,lon,depth,sx,sy,sz\na,1,2,3,1,1,1\n": "'lat' is in degrees",
     HEADER + "a,1,2,3,1,1\n": "row 2: 6 columns instead of 7",

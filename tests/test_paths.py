@@ -119,13 +119,12 @@ READ = {
     ("refine_pipeline.py", "images / camera.images / n"),
     ("report/recording.py", "result.images / model.image_name(index, frame)"),
     ("sfm/image_features.py", "image_dir / name"),
-    ("sfm/image_features.py", "options.mask_dir / f'{name}.png'"),
-    ("sfm/images.py", "Path(mask_dir) / f'{name}.png'"),
+    ("sfm/images.py", "Path(mask_dir) / f'{next(frames.image_names())}.png'"),
+    ("sfm/images.py", "mask_dir / n"),
     ("sfm/images.py", "image_dir / folder"),
     ("sfm/images.py", "image_dir / image_name"),
     ("sfm/images.py", "self.image_dir / n"),
     ("sfm/parallel.py", "frames.image_dir / next(frames.image_names())"),
-    ("sfm/start.py", "Path(options.mask_dir) / f'{name}.png'"),
 }
 """Paths of images and masks that are only read."""
 FROM_DATA = re.compile(r"image|\bname\b|frame_name|folder\b|\bn\b")

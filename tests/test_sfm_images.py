@@ -5,9 +5,15 @@ import numpy as np
 import pytest
 
 from uwsfm.errors import InputError
+from uwsfm.sfm.background import opened
 from uwsfm.sfm.features import extract_features
 from uwsfm.sfm.image_features import find_features
-from uwsfm.sfm.images import check_masks, find_frames, natural_key
+from uwsfm.sfm.images import (
+    check_masks,
+    find_frames,
+    mask_warnings,
+    natural_key,
+)
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
 from uwsfm.simulate.rigs import sample_rig
 
@@ -58,13 +64,38 @@ def test_natural_key_sorts_numbers_as_numbers():
     ]
 
 
-def test_unmatched_images_are_counted_not_dropped_silently(image_dir, rig):
+def test_a_frame_keeps_its_images_when_one_camera_lacks_its_own(image_dir, rig):
     (image_dir / "left" / "frame2.png").unlink()
     frames = find_frames(image_dir, rig)
-    assert frames.names == ("frame1.png", "frame10.png")
+    assert frames.names == ("frame1.png", "frame2.png", "frame10.png")
+    assert [frames.has_image(c, 1) for c in (0, 1)] == [False, True]
+    assert frames.num_images == 5
+    assert "left/frame2.png" not in set(frames.image_names())
     (warning,) = frames.warnings()
-    assert warning.startswith("image ") and "was left out" in warning
-    assert "right/frame2.png" in warning
+    assert "left/frame2.png does not exist: its frame is used" in warning
+
+
+def test_images_of_another_suffix_are_named_beside_the_missing_ones(image_dir, rig):
+    """One of three frames was saved as PNG on one side, as JPEG on the other."""
+    path = image_dir / "right" / "frame2.png"
+    path.rename(path.with_suffix(".jpg"))
+    (warning,) = find_frames(image_dir, rig).warnings()
+    assert warning.startswith("2 images are missing, for instance ")
+    assert "left/frame2.jpg does not exist, but left/frame2.png does" in warning
+
+
+@pytest.mark.parametrize(
+    ("rename", "words"),
+    [
+        (lambda p: p.with_suffix(".jpg"), "differ by their suffixes only"),
+        (lambda p: p.with_name(p.name.upper()), "differ by their upper and lower case"),
+    ],
+)
+def test_what_keeps_all_names_apart_is_named(image_dir, rig, rename, words):
+    for path in list((image_dir / "right").iterdir()):
+        path.rename(rename(path))
+    with pytest.raises(InputError, match=words):
+        find_frames(image_dir, rig)
 
 
 def test_files_that_are_not_images_are_ignored(image_dir, rig):
@@ -72,7 +103,7 @@ def test_files_that_are_not_images_are_ignored(image_dir, rig):
     (image_dir / "left" / "._frame1.png").write_text("x")
     frames = find_frames(image_dir, rig)
     assert len(frames.names) == 3
-    assert frames.unmatched == ()
+    assert frames.absent == frozenset()
 
 
 def test_missing_directory_is_named(tmp_path, rig):
@@ -148,21 +179,48 @@ def test_options_refuse_what_they_cannot_do(tmp_path):
         MatchOptions(strategy="random")  # type: ignore[arg-type]
 
 
+def write_mask(path, shape=(HEIGHT, WIDTH)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full(shape, 255, dtype=np.uint8))
+
+
 def test_masks_are_named_when_they_do_not_fit(image_dir, rig, tmp_path):
     frames, masks = find_frames(image_dir, rig), tmp_path / "masks"
-    with pytest.raises(InputError, match="of image left/frame1.png does not exist"):
+    with pytest.raises(InputError, match=r"first image would be .*left/frame1.png.png"):
         check_masks(frames, rig, masks)
-    white = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
     for name in frames.image_names():
-        (masks / name).parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(masks / f"{name}.png"), white)
+        write_mask(masks / f"{name}.png")
     check_masks(frames, rig, masks)
-    cv2.imwrite(str(masks / "right" / "frame2.png.png"), white[:30])
+    write_mask(masks / "right" / "frame2.png.png", (30, WIDTH))
     with pytest.raises(InputError, match="frame2.png.png has 80 x 30 pixels"):
         check_masks(frames, rig, masks)
     (masks / "right" / "frame2.png.png").write_text("no image")
     with pytest.raises(InputError, match="frame2.png.png cannot be read"):
         check_masks(frames, rig, masks)
+
+
+def test_images_without_a_mask_are_used_whole_and_counted(image_dir, rig, tmp_path):
+    """Black masks for two of six images, under both names that COLMAP knows."""
+    frames, masks = find_frames(image_dir, rig), tmp_path / "masks"
+    for name in ("left/frame1.png", "right/frame2.png.png"):
+        write_mask(masks / name)
+        black = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        cv2.imwrite(str(masks / name), black)
+    check_masks(frames, rig, masks)
+    (warning,) = mask_warnings(frames, masks)
+    assert warning.startswith("4 of 6 images have no mask")
+    assert "for instance right/frame1.png" in warning
+    options, path = FeatureOptions(mask_dir=masks), tmp_path / "work" / "f.db"
+    extract_features(frames, rig, path, options)
+    with opened(path) as database:
+        counts = {
+            image.name: len(database.read_keypoints(image.image_id))
+            for image in database.read_all_images()
+        }
+    assert [n for n in sorted(counts) if counts[n] == 0] == [
+        "left/frame1.png",
+        "right/frame2.png",
+    ]
 
 
 def test_colours_and_grey_values_come_from_one_look_at_an_image(tmp_path, rng):

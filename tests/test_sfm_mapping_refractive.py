@@ -43,6 +43,7 @@ def make_dive(
     wrong: float = 0.2,
     without: int | None = None,
     true_rig: Rig | None = None,
+    absent: frozenset[tuple[int, int]] = frozenset(),
 ) -> Dive:
     """Straight ports at half their distance: what a user would write down.
 
@@ -51,6 +52,7 @@ def make_dive(
         wrong: fraction of wrong matches.
         without: a frame in which nothing is seen.
         true_rig: the sample's by default.
+        absent: (camera, frame) of images that are not there.
     """
     true_rig = true_rig or sample_rig()
     rig = nominal_rig(true_rig)
@@ -59,6 +61,14 @@ def make_dive(
     if without is not None:
         scene, _ = scene.select(scene.frame_idx != without)
     frames = frames_of(rig, NUM_FRAMES, work_dir)
+    if absent:
+        names = frozenset(frames.image_name(c, f) for c, f in absent)
+        frames = replace(frames, absent=names)
+        there = [
+            frames.has_image(c, f)
+            for c, f in zip(scene.camera_idx, scene.frame_idx, strict=True)
+        ]
+        scene, _ = scene.select(np.array(there))
     work_dir.mkdir(exist_ok=True)
     write_features(work_dir / "database.db", scene, frames, wrong=wrong)
     return Dive(rig, frames, simulated, work_dir)
@@ -94,6 +104,31 @@ def test_frames_and_ports_are_those_of_the_dive(dive, start):
         # From 0 and 2 degrees off; six frames hardly tell the distances at 2 m.
         cosine = np.dot(found.port.normal, true.port.normal)
         assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.3
+
+
+ABSENT = frozenset({(1, 1), (0, 4)})
+
+
+@pytest.mark.parametrize("mapper", ["refractive", "pinhole"])
+def test_a_frame_without_one_camera_is_mapped_with_the_other(tmp_path, mapper):
+    """One frame lacks the right image, one the left, which is the rig's reference."""
+    dive = make_dive(tmp_path / "dive", wrong=0.1, absent=ABSENT)
+    settings = StartOptions(mapper=mapper, num_threads=1)
+    start = start_from_matches(
+        dive.rig, dive.frames, Steps(dive.work_dir), "", settings
+    )
+    arrays = start.arrays()
+    assert arrays.frame_names == dive.frames.names
+    assert start.summary["unregistered_frames"] == []
+    counts = np.zeros((2, NUM_FRAMES), dtype=int)
+    np.add.at(counts, (arrays.camera_idx, arrays.frame_idx), 1)
+    for c, f in np.ndindex(counts.shape):
+        empty = (c, f) in ABSENT
+        assert (len(arrays.keypoints[c][f]) == 0) == empty
+        assert (counts[c, f] == 0) == empty
+    # As with all images: pinholes of ports whose distance is a guess are 40 mm off.
+    limit = 5e-3 if mapper == "refractive" else 0.05
+    assert center_errors(dive, start).max() < limit
 
 
 def test_observations_are_real_pixels_of_right_matches(dive, start):

@@ -17,7 +17,6 @@ def dive(num_frames: int) -> Frames:
         image_dir=Path("dive"),
         folders=("left", "right"),
         names=tuple(f"{i}.png" for i in range(num_frames)),
-        unmatched=(),
     )
 
 

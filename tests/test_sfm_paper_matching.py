@@ -171,9 +171,7 @@ def test_an_interrupted_run_goes_on_and_a_finished_one_does_nothing(
 
 def test_images_without_features_have_no_matches(tmp_path):
     """OpenCV crashes the process when it builds the tree of nothing."""
-    blank = Frames(
-        image_dir=tmp_path, folders=("left", "right"), names=("1.png",), unmatched=()
-    )
+    blank = Frames(image_dir=tmp_path, folders=("left", "right"), names=("1.png",))
     path = tmp_path / "database.db"
     with opened(path) as database:
         camera = pycolmap.Camera(

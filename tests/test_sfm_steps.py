@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwsfm._files import PARTIAL
+from uwsfm._partial import PARTIAL
 from uwsfm.errors import UwsfmError
 from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.steps import Steps
@@ -119,9 +119,11 @@ def test_a_record_that_cannot_be_read_means_that_nothing_is_done(chain, content)
 def test_half_written_outputs_of_a_killed_run_are_removed(chain):
     (chain.work_dir / f"{PARTIAL}x1.db").write_text("half")
     (chain.work_dir / f"{PARTIAL}x2").mkdir()
+    (chain.work_dir / "colors").mkdir()
+    (chain.work_dir / "colors" / f"{PARTIAL}x3.npy").write_text("half")
     (chain.work_dir / ".mine").write_text("somebody else's")
     chain.run()
-    assert [path.name for path in chain.work_dir.glob(".*")] == [".mine"]
+    assert [path.name for path in chain.work_dir.rglob(".*")] == [".mine"]
 
 
 def test_a_database_is_removed_with_its_journals(tmp_path):

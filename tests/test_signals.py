@@ -83,7 +83,7 @@ def test_a_slow_end_is_announced(name, code):
 STOPPED_WRITING = """
 import json, os, signal, sys
 from typer.testing import CliRunner
-from uwsfm._files import PARTIAL
+from uwsfm._partial import PARTIAL
 from uwsfm.cli import app
 
 def stop(event, arguments):

@@ -2,16 +2,19 @@
 
 import os
 import signal
+import socket
+import ssl
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
+from distributed import LocalCluster
 
 import uwsfm
 from uwsfm._signals import STOPPING
@@ -75,6 +78,67 @@ def test_processes_die_and_stumble_and_the_results_are_all_there(tmp_path):
     assert counts[0] == 2
     assert counts[1] in (RETRIES + 1, RETRIES + 2)
     assert counts[2] in (1, 2)
+
+
+class Strangers:
+    """Another user of the machine, who tries all ports of some processes."""
+
+    def __init__(self) -> None:
+        self.ports: dict[int, list[str]] = {}
+        """What could be done at each port that somebody listens on."""
+        self.command_lines = ""
+
+    def __call__(self, step: str, done: int, total: int | None) -> None:
+        if done != 1 or self.ports:
+            return
+        for process in psutil.Process().children(recursive=True):
+            self.command_lines += " ".join(process.cmdline())
+            for each in process.net_connections(kind="tcp"):
+                if each.status == psutil.CONN_LISTEN:
+                    assert each.laddr.ip in ("127.0.0.1", "::1")
+                    self.ports[each.laddr.port] = list(self._tried(each.laddr.port))
+
+    def _tried(self, port: int) -> Iterator[str]:
+        """What a port answers. A scheduler of Dask greets whom it accepts."""
+        ask = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        ask.check_hostname, ask.verify_mode = False, ssl.CERT_NONE
+        for how, words in (
+            ("plain", b""),
+            ("TLS", b""),
+            ("page", b"GET /status HTTP/1.0\r\n\r\n"),
+            ("page", b"GET /health HTTP/1.0\r\n\r\n"),
+        ):
+            address = ("127.0.0.1", port)
+            with (
+                suppress(OSError),  # SSLError and timeouts are
+                socket.create_connection(address, timeout=0.5) as raw,
+            ):
+                line = ask.wrap_socket(raw) if how == "TLS" else raw
+                line.sendall(words)
+                answer = line.recv(64)
+                if answer and b" 404 " not in answer:
+                    yield f"{how}: {answer!r}"
+
+
+def test_a_stranger_does_reach_an_open_scheduler():
+    """What the next test would see without keys."""
+    with LocalCluster(
+        n_workers=0, processes=False, protocol="tcp://", dashboard_address=None
+    ) as cluster:
+        port = int(cluster.scheduler_address.rpartition(":")[2])
+        assert any(each.startswith("plain") for each in Strangers()._tried(port))
+
+
+@pytest.mark.slow
+def test_no_stranger_reaches_the_processes_of_this_machine(tmp_path):
+    strangers = Strangers()
+    with Workers(folder=tmp_path, max_processes=2) as workers:
+        assert workers.run(square, [(2,), (3,)], "squares", strangers) == [4, 9]
+    assert len(strangers.ports) >= 3  # a scheduler and two workers
+    assert {p: done for p, done in strangers.ports.items() if done} == {}
+    assert "PRIVATE KEY" not in strangers.command_lines
+    assert not any("DASK_DISTRIBUTED__COMM" in name for name in os.environ)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from uwsfm._partial import partial_prefix, scratch_folder
 from uwsfm.errors import InputError
-
-PARTIAL = ".uwsfm-partial-"
-"""Start of the names of what is being written; a killed process leaves it behind."""
 
 
 def require_regular(path: Path) -> os.stat_result:
@@ -84,7 +82,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=PARTIAL, suffix=path.suffix
+            dir=path.parent, prefix=partial_prefix(), suffix=path.suffix
         )
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
@@ -135,16 +133,16 @@ def replaced_dir(path: Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=PARTIAL))
+        partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=partial_prefix()))
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
     os.chmod(partial, 0o755)
     try:
         yield partial
         # What it replaces may take long to remove, and is needed until then.
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=PARTIAL) as old:
+        with scratch_folder(path.parent) as old:
             if path.exists():
-                os.replace(path, Path(old) / path.name)
+                os.replace(path, old / path.name)
             os.replace(partial, path)
     finally:
         if partial.exists():

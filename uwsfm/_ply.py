@@ -1,7 +1,8 @@
-"""Binary PLY tables: what MeshLab, CloudCompare and Open3D read."""
+"""PLY tables: what MeshLab, CloudCompare and Open3D write and read."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,6 +32,9 @@ _KINDS = {name: kind for kind, name in _NAMES.items()} | {
     "float32": "<f4",
     "float64": "<f8",
 }
+_LITTLE = "format binary_little_endian 1.0"
+_BIG = "format binary_big_endian 1.0"
+_ASCII = "format ascii 1.0"
 _MAX_HEADER = 65_536
 _MAX_DIGITS = 18
 """Of a count: more vertices than any disk holds."""
@@ -47,7 +51,7 @@ def write_ply(
             a triangle's three vertices, is a list, and the column before it its length.
         comment: one line.
     """
-    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    header = ["ply", _LITTLE, f"comment {comment}"]
     for element, table in tables:
         header.append(f"element {element} {len(table)}")
         header += _properties(table.dtype)
@@ -72,8 +76,8 @@ def _properties(kinds: np.dtype) -> list[str]:
 
 
 def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
-    """The vertices of a binary little-endian PLY, as a structured array, and the
-    file's comments.
+    """The vertices of a PLY, binary of either byte order or in text, as a structured
+    array in this machine's byte order, and the file's comments.
 
     Raises:
         InputError: there is no such file, or it is of another kind or cut short.
@@ -85,10 +89,17 @@ def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
             lines, size = _header(file.read(_MAX_HEADER))
         count, fields = _vertex_element(lines)
         kind = np.dtype(fields)
-        there = max(num_bytes - size, 0) // kind.itemsize
+        in_text = lines[1] == _ASCII
+        smallest = 2 * len(fields) if in_text else kind.itemsize  # a digit and a space
+        there = max(num_bytes - size + in_text, 0) // smallest
         if there < count:  # before memory is taken for what is not there
             raise InputError(f"holds {there} of its {count} vertices")
-        table = np.fromfile(path, dtype=kind, count=count, offset=size)
+        if in_text:
+            table = _text_rows(path, size, count, kind)
+        else:
+            swapped = kind if lines[1] == _LITTLE else kind.newbyteorder(">")
+            stored = np.fromfile(path, dtype=swapped, count=count, offset=size)
+            table = stored.astype(kind, copy=False)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except InputError as error:
@@ -97,21 +108,58 @@ def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
     return table, comments
 
 
+def _text_rows(path: Path, size: int, count: int, kind: np.dtype) -> np.ndarray:
+    """Rows of numbers, one vertex a line."""
+    names = kind.names or ()
+    with path.open("rb") as file:
+        file.seek(size)
+        try:
+            rows = np.loadtxt(
+                file,
+                comments=None,
+                max_rows=count,
+                usecols=range(len(names)),
+                ndmin=2,
+                encoding="ascii",
+            )
+        except (ValueError, UnicodeDecodeError) as error:
+            raise InputError(f"a vertex is no row of numbers: {error}") from None
+    if len(rows) < count:
+        raise InputError(f"holds {len(rows)} of its {count} vertices")
+    table = np.empty(count, dtype=kind)
+    for column, name in enumerate(names):
+        values, of = rows[:, column], kind[name]
+        if of.kind in "iu":
+            limits = np.iinfo(of)
+            good = (values >= limits.min) & (values <= limits.max)
+            if not np.all(good & (values == np.round(values))):
+                raise InputError(
+                    f"property {shown(name)} of a vertex is no integer from "
+                    f"{limits.min} to {limits.max}"
+                )
+        table[name] = values
+    return table
+
+
 def _header(start: bytes) -> tuple[list[str], int]:
     """Lines of the header and its size in bytes."""
-    mark = b"end_header\n"
-    end = start.find(mark)
-    if not start.startswith((b"ply\n", b"ply\r\n")):
+    if not start.startswith((b"ply\n", b"ply\r")):
         raise InputError("not a PLY file")
+    mark = re.search(rb"(?:\n|\r)end_header(?:\r\n|\n|\r)", start)
+    end = start.find(b"end_header")
     lines = start[: max(end, 0)].decode("utf-8", "replace").splitlines()
-    if end < 0 and b"end_header" not in start:
+    if mark is None:
         raise InputError(
             "not a PLY file: no end_header within its first "
             f"{min(len(start), _MAX_HEADER)} bytes"
         )
-    if end < 0 or lines[1:2] != ["format binary_little_endian 1.0"]:
-        raise InputError("only binary little-endian PLY files are read")
-    return lines, end + len(mark)
+    if len(lines) < 2 or lines[1] not in (_ASCII, _LITTLE, _BIG):
+        found = shown(lines[1]) if len(lines) > 1 else ""
+        raise InputError(
+            f"the second line of a PLY file is '{_LITTLE}', '{_BIG}' or '{_ASCII}', "
+            f"got {found!r}"
+        )
+    return lines, mark.end()
 
 
 def _vertex_element(lines: list[str]) -> tuple[int, list[tuple[str, str]]]:

@@ -326,7 +326,10 @@ def refine(
     lengths: LengthsOption = None,
     database: Annotated[
         Path | None,
-        typer.Option(help="COLMAP's database: more matches, frames that it lost."),
+        typer.Option(
+            help="COLMAP's database: more matches, frames that the model lost, and "
+            "points where it has poses only."
+        ),
     ] = None,
     scene_distance: SceneDistanceOption = None,
     also: RefineOption = None,

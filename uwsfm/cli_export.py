@@ -19,9 +19,11 @@ def export(
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder or file to write.")],
     to: Annotated[
-        Literal["pinhole", "refractive-colmap", "ply", "las", "laz"],
+        Literal["pinhole", "splatting", "refractive-colmap", "ply", "las", "laz"],
         typer.Option(
             help="pinhole: a central COLMAP model for stock tools, without refraction; "
+            "splatting: the same with the names that trainers of Gaussian splatting "
+            "want, --images needed; "
             "refractive-colmap: the text format of Refractive COLMAP; "
             "ply: points, cameras and ports in one file; las, laz: the dense cloud, or "
             "the points if there is none."
@@ -30,21 +32,52 @@ def export(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The images that were reconstructed: pinhole warps them by the depth.",
+            help="The images that were reconstructed: pinhole and splatting warp them "
+            "by the depth.",
+            show_default=False,
+        ),
+    ] = None,
+    flat_names: Annotated[
+        bool | None,
+        typer.Option(
+            "--flat-names/--folder-names",
+            help="Images as left_0001.jpg or as left/0001.jpg. Default: flat for "
+            "splatting, with folders for pinhole.",
+            show_default=False,
+        ),
+    ] = None,
+    centered: Annotated[
+        bool | None,
+        typer.Option(
+            "--centered/--not-centered",
+            help="Whether the principal point is the middle of the image, which is "
+            "some pixels wider for it. Default: centred.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
     """Write a reconstruction for other programs."""
-    if images is not None and to != "pinhole":
-        raise InputError(f"--images: --to {to} writes no images")
+    pinholes = to in ("pinhole", "splatting")
+    for option, given in (
+        ("--images", images),
+        ("--flat-names", flat_names),
+        ("--centered", centered),
+    ):
+        if given is not None and not pinholes:
+            raise InputError(f"{option}: --to {to} writes no images")
+    if to == "splatting" and images is None:
+        raise InputError(
+            "--to splatting writes images for a trainer: give the folder that was "
+            "reconstructed with --images"
+        )
     if to in ("las", "laz"):
         _export_las(model, out, to)
         return
     if model.is_file():
         raise InputError(f"{model} is a file: only --to las and laz take a PLY")
-    if to == "pinhole":
-        _export_pinhole(model, out, images)
+    if pinholes:
+        flat = to == "splatting" if flat_names is None else flat_names
+        _export_pinhole(model, out, images, flat, centered is not False)
     else:
         _export_whole(model, out, to)
     typer.echo(f"wrote {out}")
@@ -77,7 +110,9 @@ def _export_las(source: Path, out: Path, suffix: str) -> None:
     typer.echo(f"wrote {out}: {len(cloud)} points")
 
 
-def _export_pinhole(model: Path, out: Path, images: Path | None) -> None:
+def _export_pinhole(
+    model: Path, out: Path, images: Path | None, flat_names: bool, centered: bool
+) -> None:
     from uwsfm.console import ProgressBars, console
     from uwsfm.result_tables import pinhole_table
 
@@ -85,7 +120,14 @@ def _export_pinhole(model: Path, out: Path, images: Path | None) -> None:
         from uwsfm.export.files import read_model
         from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
 
-        found = export_pinhole(read_model(model), out, images, progress)
+        found = export_pinhole(
+            read_model(model),
+            out,
+            images,
+            progress,
+            flat_names=flat_names,
+            centered=centered,
+        )
     console.print(pinhole_table(pinhole_report(found)))
 
 

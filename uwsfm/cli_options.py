@@ -91,7 +91,8 @@ PositionsOption = Annotated[
     Path | None,
     typer.Option(
         help="Positions of the frames (navigation, GPS): CSV with the header "
-        "frame,x,y,z,sx,sy,sz in metres, in a local right-handed frame.",
+        "frame,x,y,z,sx,sy,sz in metres, in a local right-handed frame; or "
+        "frame,depth,sdepth where only depths are known.",
         show_default=False,
     ),
 ]

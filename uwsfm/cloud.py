@@ -91,7 +91,7 @@ def write_cloud(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
 
 
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a file of `write_cloud`, points of an adjustment, or any binary PLY.
+    """Read a file of `write_cloud`, points of an adjustment, or any other PLY.
 
     What the file does not hold is NaN; colours are then grey, views one.
 

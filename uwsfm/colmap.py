@@ -17,7 +17,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from uwsfm._checksums import check_checksums
-from uwsfm.colmap_files import check_model_files, stray_track
+from uwsfm._disk import require_room
+from uwsfm.colmap_files import check_model_files, has_files, stray_track
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -85,6 +86,22 @@ def to_reconstruction(model: Model) -> pycolmap.Reconstruction:
         )
         reconstruction.points3D[point_id].error = float(errors[point])
     return reconstruction
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a COLMAP model in binary files.
+
+    Raises:
+        DiskFullError: there is no room for it: COLMAP would write a part and say
+            nothing.
+    """
+    keypoints = sum(len(image.points2D) for image in model.images.values())
+    records = 300 * (len(model.images) + len(model.cameras) + len(model.frames))
+    num_bytes = 24 * keypoints + 51 * len(model.points3D) + records
+    num_bytes += 8 * model.compute_num_observations()
+    require_room(folder, num_bytes, "writing the model")
+    model.write_binary(str(folder))
+    check_model_files(folder)
 
 
 def _mean_by_point(values: Array, scene: Scene) -> Array:
@@ -267,9 +284,60 @@ def read_reconstruction(path: Path) -> pycolmap.Reconstruction:
             f"the files are of different models ({cause})"
         ) from None
     _check_poses(path, model)
+    if has_files(path, "bin") and has_files(path, "txt"):
+        _require_one_state(path, model)
     return model
 
 
+def _require_one_state(path: Path, model: pycolmap.Reconstruction) -> None:
+    """Refuse a folder whose text files are another state of its binary model: COLMAP
+    reads the binary ones, and the user may have edited or renewed the others."""
+    other = pycolmap.Reconstruction()
+    try:
+        other.read_text(str(path))
+    except (ValueError, RuntimeError, IndexError, OSError):
+        difference = "the text files cannot be read"
+    else:
+        difference = _difference(model, other)
+    if difference:
+        raise InputError(
+            f"{path} holds a binary and a text model that differ ({difference}): "
+            "remove the .txt files or the .bin files, whichever are out of date"
+        )
+
+
+def _difference(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> str:
+    """In what the text files differ from the binary ones, but for rounding; or ''."""
+    counts = [
+        (name, getattr(model, f"num_{name}")(), getattr(other, f"num_{name}")())
+        for name in ("cameras", "images", "points3D")
+    ]
+    for name, mine, theirs in counts:
+        if mine != theirs:
+            return f"{mine} {name} in the binary files, {theirs} in the text"
+    for camera_id, camera in model.cameras.items():
+        if not other.exists_camera(camera_id) or not np.allclose(
+            camera.params, other.cameras[camera_id].params, rtol=TEXT_ROUNDING
+        ):
+            return f"camera {camera_id}"
+    for image_id in sorted(model.images):
+        image = model.images[image_id]
+        twin = other.images[image_id] if other.exists_image(image_id) else None
+        if twin is None or twin.name != image.name or not _same_pose(image, twin):
+            return f"image {image.name}"
+    return ""
+
+
+def _same_pose(image: pycolmap.Image, twin: pycolmap.Image) -> bool:
+    if not (image.has_pose and twin.has_pose):
+        return bool(image.has_pose == twin.has_pose)
+    mine, theirs = (one.cam_from_world().params for one in (image, twin))
+    size = max(1.0, float(np.abs(mine).max()))
+    return bool(np.allclose(mine, theirs, rtol=0.0, atol=TEXT_ROUNDING * size))
+
+
+TEXT_ROUNDING = 1e-5
+"""Of numbers in text files, which older versions of COLMAP wrote with six digits."""
 FARTHEST = 1e9
 """From the origin, in any unit: what is farther away is no place under water."""
 

@@ -55,15 +55,20 @@ class Contents:
     """Cameras of each rig."""
 
 
+def has_files(folder: Path, kind: str) -> bool:
+    """Whether a folder holds a model in binary files ("bin") or in text ("txt")."""
+    return all((folder / f"{name}.{kind}").exists() for name in NAMES)
+
+
 def check_model_files(folder: Path) -> None:
     """Refuse a model whose files are damaged, cut short or of different models.
 
     Raises:
         InputError: the file, and what is wrong with it.
     """
-    if all((folder / f"{name}.bin").exists() for name in NAMES):
+    if has_files(folder, "bin"):
         _check_binary(folder)
-    elif all((folder / f"{name}.txt").exists() for name in NAMES):
+    elif has_files(folder, "txt"):
         _check_text(folder)
     else:
         binary = any((folder / f"{name}.bin").exists() for name in (*NAMES, *RIG_NAMES))

@@ -10,10 +10,8 @@ import gc
 import logging
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +20,7 @@ from numba.core import config
 
 from uwsfm._children import module_command
 from uwsfm._jit import CACHE_DIR
+from uwsfm._partial import scratch_folder
 from uwsfm._progress import Progress, silent
 from uwsfm.geometry import rigid3
 from uwsfm.scene import Scene
@@ -191,8 +190,8 @@ def _mapping() -> None:
     )
     camera = scene.cameras[0]
     estimate_relative_pose(camera, camera, scene.xy[here[a]], scene.xy[there[b]])
-    with tempfile.TemporaryDirectory() as folder:
-        steps = Steps(Path(folder))
+    with scratch_folder() as folder:
+        steps = Steps(folder)
         frames = frames_of(rig, scene.num_frames, steps.work_dir)
         write_features(steps.work_dir / "database.db", scene, frames, wrong=0.1)
         options = StartOptions(mapper="refractive", num_threads=1)

@@ -12,7 +12,7 @@ import platform
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +133,7 @@ def log_file(path: Path) -> Iterator[None]:
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = logging.FileHandler(path, encoding="utf-8")
+        file = _File(path, encoding="utf-8")
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
     file.setFormatter(logging.Formatter(FORMAT))
@@ -154,7 +154,15 @@ def log_file(path: Path) -> Iterator[None]:
         logger.removeHandler(above)
         logger.setLevel(level)
         logger.propagate = propagate
-        file.close()
+        with suppress(OSError):  # of a full disk: what is logged is the lesser loss
+            file.close()
+
+
+class _File(logging.FileHandler):
+    """A log on a disk that may be full."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Nothing: a traceback of the logger would hide the error of the job."""
 
 
 class _Above(logging.Handler):

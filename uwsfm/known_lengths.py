@@ -152,6 +152,7 @@ class KnownLengths:
             table.stddevs[rows],
             self.lever_arm,
             table.source,
+            [not table.depths_only, not table.depths_only, True],
         )
 
     def _check_distances(self, known: Distances, scene: Scene) -> None:

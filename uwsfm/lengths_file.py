@@ -16,7 +16,9 @@ centre of the first pixel is (0.5, 0.5)), and known distances between two frames
 
 A CSV of positions has the header `frame,x,y,z,sx,sy,sz`: file name of the frame,
 position of the antenna and its standard deviations, in metres, in a right-handed local
-frame (east-north-up, north-east-down, ...).
+frame (east-north-up, north-east-down, ...). Where only a depth sensor was aboard, the
+header is `frame,depth,sdepth`: metres below the surface, positive downwards. The result
+is level then, its z upwards; its heading and its place in the horizontal stay open.
 """
 
 from __future__ import annotations
@@ -39,11 +41,15 @@ from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import Entry
 
 HEADER = ["frame", "x", "y", "z", "sx", "sy", "sz"]
+DEPTH_HEADER = ["frame", "depth", "sdepth"]
 
 # Single precision, as in PLY files, is a millimetre there.
 LARGEST_M = 1e4
 LARGEST_STDDEV_M = 1e6
 """Of a position that is not known at all."""
+UNKNOWN_STDDEV_M = 1e3
+"""Of the place in the horizontal where only depths are given: it keeps the model from
+drifting away, and weighs nothing beside what the images know."""
 MAX_BYTES = 50_000_000
 """Half a million positions."""
 # A dive is longer; in degrees this is two kilometres.
@@ -100,6 +106,8 @@ class PositionTable:
     """(M, 3)"""
     stddevs: Array
     """(M, 3)"""
+    depths_only: bool = False
+    """Then x and y are zero, and nothing is known of them."""
 
 
 def load_lengths(path: str | Path) -> LengthsFile:
@@ -138,11 +146,11 @@ def load_positions(path: str | Path) -> PositionTable:
         raise InputError(f"{path}: {error}") from None
     except csv.Error:
         raise InputError(f"{path}: is not a table of text in UTF-8") from None
-    _check_header(path, [cell.strip().lower() for cell in rows[0]] if rows else [])
+    header = _header(path, [cell.strip().lower() for cell in rows[0]] if rows else [])
     frames: dict[str, None] = {}
     numbers = []
     for i, row in enumerate(rows[1:], 2):
-        name, values = _row(f"{path}: row {i}", row)
+        name, values = _row(f"{path}: row {i}", row, header)
         if name in frames:
             raise InputError(f"{path}: row {i}: frame {name!r} is given twice")
         frames[name] = None
@@ -152,18 +160,30 @@ def load_positions(path: str | Path) -> PositionTable:
             f"{path}: {len(frames)} positions are too few: at least 3 are needed"
         )
     table = np.array(numbers)
+    depths_only = header == DEPTH_HEADER
+    if depths_only:
+        table = _upwards(table)
     _check_units(path, table[:, :3])
     return PositionTable(
         source=str(path),
         frames=tuple(frames),
         positions=table[:, :3],
         stddevs=table[:, 3:],
+        depths_only=depths_only,
     )
 
 
-def _check_header(path: Path, header: list[str]) -> None:
-    if header == HEADER:
-        return
+def _upwards(depths: Array) -> Array:
+    """Rows x, y, z, sx, sy, sz of depths and their standard deviations (M, 2)."""
+    rows = np.zeros((len(depths), 6))
+    rows[:, 2], rows[:, 5] = -depths[:, 0], depths[:, 1]
+    rows[:, 3:5] = UNKNOWN_STDDEV_M
+    return rows
+
+
+def _header(path: Path, header: list[str]) -> list[str]:
+    if header in (HEADER, DEPTH_HEADER):
+        return header
     expected = ",".join(HEADER)
     geographic = [name for name in header if name.startswith(("lat", "lon", "lng"))]
     if geographic:
@@ -172,14 +192,17 @@ def _check_header(path: Path, header: list[str]) -> None:
             f"a local frame, with the header {expected}"
         )
     found = ",".join(header)
-    raise InputError(f"{path}: the header must be {expected}, got {found!r}")
+    raise InputError(
+        f"{path}: the header must be {expected}, or {','.join(DEPTH_HEADER)} where "
+        f"only depths are known; got {found!r}"
+    )
 
 
-def _row(where: str, row: list[str]) -> tuple[str, list[float]]:
-    if len(row) != len(HEADER):
-        raise InputError(f"{where}: {len(row)} columns instead of {len(HEADER)}")
+def _row(where: str, row: list[str], header: list[str]) -> tuple[str, list[float]]:
+    if len(row) != len(header):
+        raise InputError(f"{where}: {len(row)} columns instead of {len(header)}")
     values = []
-    for name, cell in zip(HEADER[1:], row[1:], strict=True):
+    for name, cell in zip(header[1:], row[1:], strict=True):
         try:
             value = float(cell)
         except ValueError:

@@ -8,6 +8,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from uwsfm._checksums import SUMS
+from uwsfm._disk import explained
+from uwsfm._partial import remove_stale
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.calibration_file import CALIBRATION
 from uwsfm.export.files import (
@@ -107,6 +109,8 @@ def _made_by_us(out: Path) -> bool:
 def locked(out: Path) -> Iterator[None]:
     """Keep a second run out of the folder: both would write the same database.
 
+    What killed runs left half-written there is removed, and a full disk is explained.
+
     The folders that a run made only to lock them go when it ends with nothing in them
     but its log, unless that holds the traceback of an error that no sentence explains.
     """
@@ -121,8 +125,10 @@ def locked(out: Path) -> Iterator[None]:
         raise InputError(f"another uwsfm is at work in {out}") from None
     except OSError as error:
         raise InputError(f"cannot write to {out}: {error.strerror}") from None
+    remove_stale(out, deep=True)
     try:
-        yield
+        with explained(out):
+            yield
     except Exception as error:
         told = isinstance(error, UwsfmError)
         raise

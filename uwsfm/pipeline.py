@@ -317,7 +317,8 @@ def _summary(
     found = errors_summary(refined.calibration)
     after = found.pop("reprojection_rms_px")
     return {
-        "num_frames": mapped.pop("num_frames"),
+        "num_frames": mapped["num_frames"],
+        "num_images": mapped.pop("num_frames") * len(model.rig.cameras),
         "unregistered_frames": mapped.pop("unregistered_frames"),
         **found,
         "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},

@@ -42,7 +42,6 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
 from uwsfm.sfm.colors import point_colors
-from uwsfm.sfm.images import image_fault
 from uwsfm.sfm.model_database import (
     ImageDatabase,
     read_image_database,
@@ -50,6 +49,7 @@ from uwsfm.sfm.model_database import (
 )
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
+from uwsfm.sfm.pixels import image_fault
 from uwsfm.sfm.refine import (
     Refined,
     rig_options,
@@ -120,7 +120,8 @@ def refine_model(
             without it they keep the colours of the model, and what only the database
             has is black.
         database: COLMAP's database of the model: tracks are made again from all its
-            matches, and frames that the model lacks are registered. It is not changed.
+            matches, and frames that the model lacks are registered; a model of poses
+            alone gets its points from it. It is not changed.
         scene_distance_m: Of a single camera's scene, about: without a baseline it sets
             the scale to start with; None: 1.
         positions, lever_arm, lengths, report: As in `reconstruct`.
@@ -147,13 +148,14 @@ def refine_model(
             "would replace: choose another folder"
         )
     clock = time.perf_counter()
-    start = start_from_model(found, rig, distance_m)
+    database = None if database is None else Path(database)
+    start = start_from_model(found, rig, distance_m, database)
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images, rig, start)
     matches, names = None, start.model.frame_names
     if database is not None:
-        matches = read_image_database(Path(database), start.model, rig)
+        matches = read_image_database(database, start.model, rig)
         names = matches.frame_names
     known = KnownLengths.read(lengths, positions, lever_arm)
     known.check_names(rig, names)
@@ -384,6 +386,7 @@ class _Job:
         error = model.errors_px()[both]
         return {
             "num_frames": len(names),
+            "num_images": len(names) * len(model.rig.cameras),
             "unregistered_frames": unregistered,
             **found,
             "reprojection_rms_px": {"before": refined.start_rms_px, "after": after},

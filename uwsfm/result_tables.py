@@ -99,6 +99,9 @@ def result_table(summary: dict[str, Any]) -> Table:
     rms = summary["reprojection_rms_px"]
     frames = f"{summary['num_registered_frames']} of {summary['num_frames']}"
     table.add_row("frames registered", frames)
+    if "num_images" in summary and len(summary["cameras"]) > 1:
+        images = f"{summary['num_registered_images']} of {summary['num_images']}"
+        table.add_row("images registered", images)
     table.add_row("points", f"{summary['num_points']}")
     table.add_row("observations", f"{summary['num_observations']}")
     table.add_row("invalid observations", f"{summary['num_invalid']}")
@@ -324,7 +327,7 @@ def _add_positions(table: Table, positions: dict[str, Any] | None) -> None:
     used = positions["num_positions"] - len(positions["outliers"])
     table.add_row("positions used", f"{used} of {positions['num_positions']}")
     table.add_row("they miss the model by", f"{positions['rms_miss_m']:.3g} m RMS")
-    place = ", ".join(f"{value:.2g}" for value in positions["place_stddev_m"])
+    place = ", ".join(_number(v, "{:.2g}") for v in positions["place_stddev_m"])
     turn = positions["turn_stddev_deg"]
     table.add_row("± of the model's place", f"{place} m; its turn {turn:.2g} deg")
 

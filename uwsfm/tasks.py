@@ -13,13 +13,14 @@ import os
 import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwsfm._children import SAFE_PATH, import_path
-from uwsfm._files import PARTIAL
+from uwsfm._cluster_keys import secrets_of
+from uwsfm._partial import partial_prefix
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
@@ -180,10 +181,13 @@ class Workers:
         """A cluster of processes of one thread each, which end with the stack.
 
         They are started by command line: a process that is spawned from here would run
-        the caller's script again. If this one is killed, they end by themselves.
+        the caller's script again. If this one is killed, they end by themselves. Who
+        can reach a scheduler can run code as its user: all of them speak TLS, with keys
+        that nobody else has, and none serves a page.
         """
         import dask
         from distributed import Client, LocalCluster, SubprocessCluster
+        from distributed.security import Security
 
         _log_as_all_do()
         logger.info("starting %d worker processes", self.num_processes)
@@ -191,9 +195,11 @@ class Workers:
             self._folder.mkdir(parents=True, exist_ok=True)
         # In a workspace, what a killed run could not remove is gone with the next.
         scratch = processes.enter_context(
-            tempfile.TemporaryDirectory(prefix=PARTIAL, dir=self._folder)
+            tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=self._folder)
         )
+        security = Security.temporary()
         common: dict[str, Any] = {
+            "security": security,
             "n_workers": self.num_processes,
             "threads_per_worker": 1,
             "dashboard_address": None,
@@ -201,17 +207,24 @@ class Workers:
         }
         each: dict[str, Any] = {
             "local_directory": scratch,
+            "dashboard": False,
             "env": {"NUMBA_NUM_THREADS": "1"},  # whatever is set here
         }
         preload = [ENDS_WITH_PARENT.format(parent=os.getpid(), path=import_path())]
-        with _careful_starts(), dask.config.set({"temporary-directory": scratch}):
+        with (
+            _careful_starts(secrets_of(security)),
+            dask.config.set({"temporary-directory": scratch}),
+        ):
             if sys.platform == "win32":  # where processes can only be spawned
-                cluster = LocalCluster(**common, **each)
+                cluster = LocalCluster(**common, **each, protocol="tls://")
             else:
                 cluster = SubprocessCluster(
                     **common,
                     worker_kwargs={**each, "preload_nanny": preload},
                     scheduler_kwargs={
+                        "protocol": "tls://",
+                        "dashboard": False,
+                        "dashboard_address": "127.0.0.1:0",  # an empty page
                         "preload": preload,
                         "local_directory": scratch,
                         # Dask removes it at its end, if it gets there: our folder is.
@@ -351,10 +364,14 @@ def _sees(path: str) -> bool:
 
 
 @contextmanager
-def _careful_starts() -> Iterator[None]:
-    """Processes that are started tell errors only, from their first line on, and
-    import nothing from the working folder."""
-    wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1"}
+def _careful_starts(secrets: Mapping[str, str]) -> Iterator[None]:
+    """Processes that are started tell errors only, from their first line on, import
+    nothing from the working folder, and know secrets of this one.
+
+    Args:
+        secrets: environment variables, see `secrets_of`.
+    """
+    wanted = {"DASK_LOGGING__DISTRIBUTED": "error", SAFE_PATH: "1", **secrets}
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:

@@ -241,7 +241,7 @@ def _images() -> Kind:
     import cv2
 
     from uwsfm.errors import InputError
-    from uwsfm.sfm.images import image_fault
+    from uwsfm.sfm.pixels import image_fault
 
     pixels = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
     files = {

@@ -72,7 +72,6 @@ class Dive:
             image_dir=image_dir,
             folders=tuple(camera.images for camera in self.rig.cameras),
             names=self.names,
-            unmatched=(),
         )
 
     def write_database(self, path: Path) -> None:

@@ -88,9 +88,18 @@ def _positions(fit: PositionFit) -> list[str]:
         "check the lever arm and its signs, the axes (right-handed, metres) and which "
         "frame each position belongs to"
     )
+    if not fit.measured.all():
+        check = (
+            "check the lever arm and its signs, the unit (metres) and the sign of the "
+            "depths, and which frame each belongs to"
+        )
+        sentences.append(
+            "depths level the model and give its height; its heading and its place in "
+            "the horizontal are arbitrary"
+        )
     if wrong:
         advice = f": {check}" if wrong > MANY_OUTLIERS * count else ""
-        if count < FEW_POSITIONS:
+        if count < FEW_POSITIONS and fit.measured.all():
             advice = (
                 "; with so few, mirrored axes (two swapped, or one of the wrong sign) "
                 f"look like that too: {check}"

@@ -18,6 +18,10 @@ def _no_indices() -> IndexArray:
     return np.empty(0, dtype=np.int64)
 
 
+def _all_three() -> NDArray[np.bool_]:
+    return np.ones(3, dtype=bool)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Distances:
     """Known distances between pairs."""
@@ -76,6 +80,9 @@ class Positions:
     """(3,) the antenna in the rig's frame, that of the first camera."""
     source: str = "positions"
     """The file that they are from, for messages."""
+    measured: NDArray[np.bool_] = field(default_factory=_all_three)
+    """(3,) coordinates that were measured. The others are zero with a wide standard
+    deviation: they hold the model somewhere, and their misses do not count."""
 
     @classmethod
     def from_arrays(
@@ -85,11 +92,12 @@ class Positions:
         covariances: ArrayLike,
         lever_arm: ArrayLike = (0.0, 0.0, 0.0),
         source: str = "positions",
+        measured: ArrayLike = (True, True, True),
     ) -> "Positions":
         """Check the arrays.
 
         Args:
-            frame_idx, positions, lever_arm, source: as in the class.
+            frame_idx, positions, lever_arm, source, measured: as in the class.
             covariances: (M, 3, 3), or standard deviations (M, 3), or one (3,) for all.
 
         Raises:
@@ -123,6 +131,7 @@ class Positions:
             covariances=spread,
             lever_arm=arm,
             source=source,
+            measured=np.array(measured, dtype=bool),
         )
 
 
@@ -230,7 +239,7 @@ class PositionFit:
     frame_idx: IndexArray
     """(M,) of the positions whose frames took part."""
     misses_m: Array
-    """(M, 3) antenna of the model minus position."""
+    """(M, 3) antenna of the model minus position; zero in what was not measured."""
     inliers: NDArray[np.bool_]
     """(M,) positions that the last solve used."""
     scatter: float
@@ -239,6 +248,8 @@ class PositionFit:
     covariance: Array
     """(6, 6) of the model's place in the frame of the positions: rotation (radians)
     about the middle of the positions, and translation (metres) of that middle."""
+    measured: NDArray[np.bool_] = field(default_factory=_all_three)
+    """(3,) as of the `Positions`."""
 
     def in_frames(self, frames: IndexArray) -> "PositionFit":
         """The fit of some frames (F',), numbered as they are there."""
@@ -256,6 +267,10 @@ class PositionFit:
 
     @property
     def turn(self) -> tuple[float, Array]:
-        """Largest standard deviation of the rotation, radians, and its axis (3,)."""
-        values, vectors = np.linalg.eigh(self.covariance[:3, :3])
-        return float(np.sqrt(values[-1])), vectors[:, -1]
+        """Largest standard deviation of the rotation, radians, and its axis (3,).
+
+        Depths say nothing of the heading: of these, the tilt only.
+        """
+        axes = np.eye(3) if self.measured.all() else np.eye(3)[:, :2]
+        values, vectors = np.linalg.eigh(axes.T @ self.covariance[:3, :3] @ axes)
+        return float(np.sqrt(values[-1])), axes @ vectors[:, -1]

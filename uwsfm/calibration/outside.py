@@ -33,6 +33,9 @@ OPEN_SCALE, HOPELESS_SCALE = 0.5, 2.0
 # Cauchy's c of the positions while outliers are told apart, in standard deviations.
 LOSS_SCALE = 3.0
 
+CHI2 = {3: (MEDIAN_CHI2_3, LIMIT_CHI2_3), 1: (0.455, 10.83)}
+"""Median and upper thousandth of chi^2, by the coordinates that were measured."""
+
 
 class Outside:
     """The lengths of one calibration, and what it decides about them."""
@@ -191,10 +194,13 @@ class Outside:
         )
 
     def squares(self, state: State) -> Array:
-        """(M,) squared misses of the positions over their given covariances."""
+        """(M,) squared misses of what was measured over the given covariances."""
         miss, known = self.misses(state), self.lengths.positions
         assert known is not None
-        return np.einsum("ni,nij,nj->n", miss, np.linalg.inv(known.covariances), miss)
+        rows = known.measured
+        covariances = known.covariances[:, rows][:, :, rows]
+        inverses, miss = np.linalg.inv(covariances), miss[:, rows]
+        return np.einsum("ni,nij,nj->n", miss, inverses, miss)
 
     def misses(self, state: State) -> Array:
         """(M, 3) antenna minus position, metres, in the frame of the positions."""
@@ -220,16 +226,21 @@ class Outside:
                 state.rig_from_world, self.lengths, with_scale=self.one_camera
             )
         before = (self.robust, self.scatter, self.inliers)
+        size = int(np.count_nonzero(known.measured))
+        median, limit = CHI2[size]
         squares = np.where(self.present, self.squares(state), np.inf)
         middle = float(np.median(squares[self.present]))
-        spread = max(1.0, middle / MEDIAN_CHI2_3)
-        near = squares <= LIMIT_CHI2_3 * spread
-        count = 3 * int(np.count_nonzero(near))
-        variance = float(np.sum(squares[near])) / max(count - 6, 1)
+        spread = max(1.0, middle / median)
+        near = squares <= limit * spread
+        # The place in space takes two degrees of freedom per coordinate: heights leave
+        # the heading and the horizontal open, and take three.
+        taken = 6 if size == 3 else 3
+        freedom = max(size * int(np.count_nonzero(near)) - taken, 1)
+        variance = float(np.sum(squares[near])) / freedom
         # The given standard deviations are believed until chance cannot explain it.
-        chance = 1.0 + 3.0 * np.sqrt(2.0 / max(count - 6, 1))
+        chance = 1.0 + 3.0 * np.sqrt(2.0 / freedom)
         self.scatter = float(np.sqrt(variance)) if variance > chance else 1.0
-        self.inliers = squares <= LIMIT_CHI2_3 * self.scatter**2
+        self.inliers = squares <= limit * self.scatter**2
         self.robust = False
         if np.count_nonzero(self.inliers) < 3:
             raise UwsfmError(
@@ -269,10 +280,11 @@ class Outside:
             return None
         return PositionFit(
             frame_idx=known.frame_idx,
-            misses_m=self.misses(state),
+            misses_m=self.misses(state) * known.measured,
             inliers=self.inliers,
             scatter=self.scatter,
             covariance=covariance,
+            measured=known.measured,
         )
 
     def entered(self) -> Lengths | None:

@@ -7,7 +7,12 @@ import numpy as np
 from uwsfm.calibration.lengths import Distances, Lengths
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.alignment import Similarity, align_robustly, fits_mirrored
+from uwsfm.geometry.alignment import (
+    Similarity,
+    align_heights,
+    align_robustly,
+    fits_mirrored,
+)
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene
 from uwsfm.solver.terms import centers
@@ -71,9 +76,24 @@ def alignment(scene: Scene, lengths: Lengths, *, with_scale: bool) -> Similarity
 
     With a scale, the lever arm is taken as it is: it is short against the track.
     """
+    known = lengths.positions
+    assert known is not None
+    if not known.measured.all():
+        antenna, places, _ = _matched(scene.rig_from_world, lengths)
+        up = _upwards(scene.rig_from_world)
+        return align_heights(antenna, places[:, 2], up, with_scale=with_scale)
     return align_robustly(
         *_matched(scene.rig_from_world, lengths), with_scale=with_scale
     )
+
+
+def _upwards(rig_from_world: Array) -> Array:
+    """(3,) roughly upwards: cameras look down or ahead rather than up, and their images
+    are rather upright than not."""
+    world_from_rig = rigid3.inverse(rig_from_world)
+    axes = rigid3.rotate(world_from_rig, np.array([0.0, -1.0, -1.0]))
+    mean: Array = axes.mean(axis=0)
+    return mean
 
 
 def _matched(rig_from_world: Array, lengths: Lengths) -> tuple[Array, Array, Array]:
@@ -101,6 +121,8 @@ def require_right_handed(
     """
     known = lengths.positions
     assert known is not None
+    if not known.measured.all():
+        return  # the mirror image of heights is a turn upside down
     if fits_mirrored(*_matched(rig_from_world, lengths), with_scale=with_scale):
         raise InputError(
             f"{known.source}: the axes of the positions are mirrored: with two of x, "
@@ -118,6 +140,8 @@ def require_metres(scene: Scene, lengths: Lengths) -> None:
     """
     known = lengths.positions
     assert known is not None
+    if not known.measured.all():
+        return  # depths along a slope fit every scale, with another tilt
     scale = alignment(scene, lengths, with_scale=True).scale
     spread = float(np.linalg.norm(np.std(known.positions, axis=0)))
     noise = float(np.sqrt(np.median(np.trace(known.covariances, 0, 1, 2))))

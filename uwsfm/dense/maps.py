@@ -32,6 +32,8 @@ from uwsfm.sfm.steps import fingerprint
 
 FOLDER = "dense"
 """In the workspace."""
+BYTES_ON_DISK = 8
+"""Per pixel: two floats in single precision."""
 SMALLEST_TILE = (16 * MULTIPLE) ** 2 * COST_BYTES * 512
 """Bytes of the matcher."""
 FORMAT = 3
@@ -88,6 +90,15 @@ class DepthMaps:
         for view in self.views:
             for name in (view.name, *view.other_names):
                 image_path(self.images, name)
+
+    def missing_bytes(self) -> int:
+        """What the depth maps that are not there will take on the disk."""
+        lenses = [
+            self.model.scene.cameras[view.camera]
+            for view in self.views
+            if not self._path(view).exists()
+        ]
+        return sum(BYTES_ON_DISK * lens.width * lens.height for lens in lenses)
 
     def make(self, index: int, budget: float) -> dict[str, Any]:
         """Make a depth map unless it is there; what is known of it.

@@ -15,7 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from uwsfm._disk import explained, require_room
 from uwsfm._files import require_writable
+from uwsfm._partial import remove_stale
 from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
@@ -72,7 +74,11 @@ def dense_cloud(
     settings = _parsed(options)
     result = open_result(out, images)
     source = result.require_images()
-    with job_log(result.folder, "uwsfm dense", asked, progress) as log:
+    remove_stale(result.folder, deep=True)
+    with (
+        explained(result.folder),
+        job_log(result.folder, "uwsfm dense", asked, progress) as log,
+    ):
         with _Run(result, source, settings, log.progress) as run:
             cloud = run.cloud()
         log.result(cloud.summary)
@@ -116,6 +122,7 @@ class _Run:
 
         Raises:
             InputError: one sentence.
+            DiskFullError: there is no room for the depth maps.
         """
         count, wanted = len(self.views), self.options.min_views
         if wanted > (max(count, 2) if self.options.keep_single else count):
@@ -129,6 +136,8 @@ class _Run:
             )
         require_writable(self.result.folder / DENSE_CLOUD)
         self.maps.require_images()
+        needed = self.maps.missing_bytes()
+        require_room(self.result.folder, needed, "making depth maps")
 
     def cloud(self) -> DenseResult:
         self.check()

@@ -14,7 +14,7 @@ from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene
-from uwsfm.sfm.images import read_color, size_fault
+from uwsfm.sfm.pixels import read_color, size_fault
 
 MIN_POINTS = 10
 """Of a frame, to know its depths from; with fewer those of all frames serve."""

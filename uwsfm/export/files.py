@@ -15,6 +15,7 @@ from uwsfm.colmap import (
     from_reconstruction,
     read_reconstruction,
     to_reconstruction,
+    write_model,
 )
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import RUN_AGAIN
@@ -84,7 +85,7 @@ def export_colmap(model: Model, folder: str | Path) -> None:
     """Write a COLMAP binary model: cameras, rigs, frames, images, points3D."""
     reconstruction = to_reconstruction(model)
     with replaced_dir(Path(folder)) as partial:
-        reconstruction.write_binary(str(partial))
+        write_model(reconstruction, partial)
 
 
 def export_ply(

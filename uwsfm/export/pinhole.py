@@ -74,11 +74,16 @@ class PinholeModel:
     """The same of observations, and those of points that do not project."""
 
 
-def pinhole_model(model: Model) -> PinholeModel:
+def pinhole_model(model: Model, *, centered: bool = True) -> PinholeModel:
     """The central model that sees the points of a refractive one.
 
     Without noise the points project exactly onto their keypoints; with it they keep
     their residuals.
+
+    Args:
+        model: the refractive one.
+        centered: the principal points are the middles of the images, which are some
+            pixels wider for it: many trainers of radiance fields take it for granted.
 
     Raises:
         InputError: a camera has seen no point.
@@ -86,7 +91,7 @@ def pinhole_model(model: Model) -> PinholeModel:
     scene, counted = _usable(model)
     in_cam = scene.points_in_cam()
     pinholes = tuple(
-        _fit(model, camera, in_cam[scene.camera_idx == index, 2])
+        _fit(model, camera, in_cam[scene.camera_idx == index, 2], centered)
         for index, camera in enumerate(scene.cameras)
     )
     depths: list[tuple[ImageDepth, ...]] = []
@@ -222,12 +227,30 @@ def _depth_of(pinhole: VirtualPinhole) -> float:
     return pinhole.depth - float(pinhole.center_in_cam[2])
 
 
-def _fit(model: Model, camera: RefractiveCamera, depths: Array) -> VirtualPinhole:
+def _fit(
+    model: Model, camera: RefractiveCamera, depths: Array, centered: bool
+) -> VirtualPinhole:
     if not len(depths):
         index = model.scene.cameras.index(camera)
         name = model.rig.cameras[index].name
         raise InputError(f"camera {name} sees no point: its distance is unknown")
-    return fit_virtual_pinhole(camera, np.percentile(depths, [10, 50, 90]))
+    found = fit_virtual_pinhole(camera, np.percentile(depths, [10, 50, 90]))
+    return _centered(found) if centered else found
+
+
+def _centered(pinhole: VirtualPinhole) -> VirtualPinhole:
+    """The same pinhole with an image that reaches equally far on opposite sides."""
+    size = (pinhole.width, pinhole.height)
+    half = [
+        int(np.ceil(max(x, length - x)))
+        for x, length in zip(pinhole.principal_point, size, strict=True)
+    ]
+    return replace(
+        pinhole,
+        principal_point=(float(half[0]), float(half[1])),
+        width=2 * half[0],
+        height=2 * half[1],
+    )
 
 
 def _moved(seen: _Seen, depth: ImageDepth, xy: Array, observed: IndexArray) -> Array:

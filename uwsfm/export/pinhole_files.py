@@ -1,6 +1,7 @@
 """The folder that `uwsfm export --to pinhole` writes."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,19 @@ import numpy as np
 
 from uwsfm._files import checked_target, replaced_dir
 from uwsfm._progress import Progress, silent
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap import Model, to_reconstruction, write_model
 from uwsfm.errors import InputError
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
 from uwsfm.export.summary import write_json
+from uwsfm.export.trainers import (
+    IMAGES,
+    MASKS,
+    Place,
+    image_names,
+    image_places,
+    mask_names,
+    write_transforms,
+)
 from uwsfm.export.warp import read_image, warp_image, warp_maps, write_image
 
 REPORT = "pinhole.json"
@@ -23,18 +33,26 @@ def export_pinhole(
     folder: str | Path,
     images: str | Path | None = None,
     progress: Progress = silent,
+    *,
+    flat_names: bool = False,
+    centered: bool = True,
 ) -> PinholeModel:
     """Write a central COLMAP model, and the images warped to it if they are given.
 
     The layout is that of COLMAP's undistorter: ``sparse/0``, ``images`` and ``masks``
     (COLMAP's naming; black: nothing was photographed, or no points surround the
-    pixel and its depth is a guess). ``pinhole.json`` tells how exact each image is.
+    pixel and its depth is a guess). With images, ``transforms.json`` and
+    ``sparse_pc.ply`` describe the same to nerfstudio. ``pinhole.json`` reports how
+    exact each image is.
 
     Args:
         model: of `uwsfm.read_model`.
         folder: to write; must not exist.
         images: the folder that was reconstructed, with one folder per camera.
         progress: called once per image.
+        flat_names: ``left_0001.jpg`` instead of ``left/0001.jpg``, and masks as
+            ``left_0001.png`` too: trainers of Gaussian splatting want both.
+        centered: as of `pinhole_model`.
 
     Raises:
         InputError: the folder exists, an image is missing or of another size, or a
@@ -43,16 +61,26 @@ def export_pinhole(
     target = checked_target(folder)
     if images is not None:
         _check_images(model, Path(images))
-    found = pinhole_model(model)
+    found = pinhole_model(model, centered=centered)
+    names = image_names(model, flat=flat_names)
     reconstruction = to_reconstruction(found.model)
+    written = {model.image_name(*place): name for place, name in names.items()}
+    for image in reconstruction.images.values():
+        image.name = written[image.name]
     with replaced_dir(target) as partial:
         sparse = partial / "sparse" / "0"
         sparse.mkdir(parents=True)
-        reconstruction.write_binary(str(sparse))
+        write_model(reconstruction, sparse)
         known = None
         if images is not None:
-            known = _warp_all(model, found, Path(images), partial, progress)
-        write_json(pinhole_report(found, known), partial / REPORT)
+            known = _warp_all(
+                model, found, Path(images), partial, names, flat_names, progress
+            )
+            write_transforms(partial, found.model, names, flat=flat_names)
+        report = pinhole_report(found, known)
+        for entry in report["images"]:
+            entry["written_as"] = written[entry["name"]]
+        write_json(report, partial / REPORT)
     return found
 
 
@@ -116,17 +144,11 @@ def _largest(values: list[float]) -> float | None:
     return max(finite) if finite else None
 
 
-def _places(model: Model) -> list[tuple[int, int]]:
-    """Camera and frame of the images that are there."""
-    shape = len(model.scene.cameras), model.scene.num_frames
-    return [(c, f) for c, f in np.ndindex(shape) if model.has_image(c, f)]
-
-
 def _check_images(model: Model, images: Path) -> None:
     """Refuse at once what would fail after minutes."""
     if not images.is_dir():
         raise InputError(f"{images}: no such folder of images")
-    for c, f in _places(model):
+    for c, f in image_places(model):
         path = images / model.image_name(c, f)
         if not path.is_file():
             raise InputError(f"{path}: no such image")
@@ -137,18 +159,20 @@ def _warp_all(
     found: PinholeModel,
     images: Path,
     folder: Path,
+    names: Mapping[Place, str],
+    flat: bool,
     progress: Progress,
 ) -> dict[str, float]:
     """Write images and masks; the share of each image that points surround."""
     known = {}
-    places = _places(model)
-    for done, (c, f) in enumerate(places, start=1):
+    for done, ((c, f), target) in enumerate(names.items(), start=1):
         name = model.image_name(c, f)
         camera = model.scene.cameras[c]
         image = read_image(images / name, camera)
         maps, mask = warp_maps(camera, found.pinholes[c], found.depths[c][f])
-        write_image(folder / "images", name, warp_image(image, maps))
-        write_image(folder / "masks", f"{name}.png", np.uint8(255) * mask)
+        write_image(folder / IMAGES, target, warp_image(image, maps))
+        for mask_name in mask_names(target, flat=flat):
+            write_image(folder / MASKS, mask_name, np.uint8(255) * mask)
         known[name] = float(np.mean(mask))
-        progress("warping images", done, len(places))
+        progress("warping images", done, len(names))
     return known

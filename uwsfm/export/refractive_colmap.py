@@ -1,10 +1,10 @@
 """The text format of Refractive COLMAP, see `uwsfm.sfm.refractive_colmap`: written."""
 
 import shutil
-import tempfile
 from pathlib import Path
 
 from uwsfm._files import checked_target, replaced_dir
+from uwsfm._partial import scratch_folder
 from uwsfm._paths import shown, white_space_fault
 from uwsfm.colmap import Model, to_reconstruction
 from uwsfm.errors import InputError
@@ -43,10 +43,10 @@ def export_refractive_colmap(model: Model, folder: str | Path) -> None:
         index + 1: PortCamera(camera=reconstruction.cameras[index + 1], port=port)
         for index, port in enumerate(model.scene.ports)
     }
-    with replaced_dir(target) as partial, tempfile.TemporaryDirectory() as name:
-        reconstruction.write_text(name)
+    with replaced_dir(target) as partial, scratch_folder() as text_model:
+        reconstruction.write_text(str(text_model))
         for other in (IMAGES, POINTS):  # rigs.txt and frames.txt are unknown to it
-            shutil.copy(Path(name) / other, partial / other)
+            shutil.copy(text_model / other, partial / other)
         text = _HEADER.format(count=len(cameras))
         text += "".join(camera_line(number, cameras[number]) for number in cameras)
         (partial / CAMERAS).write_text(text, encoding="ascii")

@@ -42,16 +42,20 @@ class Lines:
     """(V, 3) RGB"""
 
 
-def export_scene_ply(model: Model, path: str | Path, *, unit: str = "metre") -> None:
+def export_scene_ply(
+    model: Model, path: str | Path, *, unit: str = "metre", edge_colors: bool = False
+) -> None:
     """Write points, frusta and port outlines as one binary PLY with edges.
 
     Vertices: x y z (float, metres, world), red green blue (uchar), the points first.
-    Edges: vertex1 vertex2 (int), red green blue.
+    Edges: vertex1 vertex2 (int), and with ``edge_colors`` red green blue.
 
     Args:
         model: what to write.
         path: the file; must not exist.
         unit: of lengths, for the comment in the file.
+        edge_colors: MeshLab draws edges in the colours of their own; trimesh reads no
+            file that has them.
 
     Raises:
         InputError: the file exists or cannot be written.
@@ -63,7 +67,7 @@ def export_scene_ply(model: Model, path: str | Path, *, unit: str = "metre") -> 
     length = _FRUSTUM_SHARE * float(np.nanmedian(ranges)) if len(ranges) else 0.1
     finite = np.all(np.isfinite(scene.points), axis=1)
     vertices, colors = [scene.points[finite]], [model.colors[finite]]
-    edges, edge_colors = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, 3), "u1")]
+    edges, of_edges = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, 3), "u1")]
     count = len(vertices[0])
     for index, camera in enumerate(scene.cameras):
         lines = camera_lines(camera, length, _COLORS[index % len(_COLORS)])
@@ -76,9 +80,14 @@ def export_scene_ply(model: Model, path: str | Path, *, unit: str = "metre") -> 
             vertices.append(rigid3.transform(pose, lines.vertices))
             colors.append(lines.colors)
             edges.append(lines.edges + count)
-            edge_colors.append(lines.colors[lines.edges[:, 1]])
+            of_edges.append(lines.colors[lines.edges[:, 1]])
             count += len(lines.vertices)
-    _write(target, unit, vertices, colors, edges, edge_colors)
+    rgb = [(name, "u1") for name in ("red", "green", "blue")]
+    rows = _rows([(axis, "<f4") for axis in "xyz"] + rgb, vertices, colors)
+    ends = [("vertex1", "<i4"), ("vertex2", "<i4")]
+    table = _rows(ends + rgb, edges, of_edges) if edge_colors else _rows(ends, edges)
+    tables = [("vertex", rows), ("edge", table)]
+    write_ply(target, tables, comment=f"unit: {unit}; uwsfm")
 
 
 def camera_lines(
@@ -135,29 +144,10 @@ def _joined(lines: list[Array], colors: list[NDArray[np.uint8]]) -> Lines:
     )
 
 
-def _write(
-    path: Path,
-    unit: str,
-    vertices: list[Array],
-    colors: list[NDArray[np.uint8]],
-    edges: list[IndexArray],
-    edge_colors: list[NDArray[np.uint8]],
-) -> None:
-    rgb = [(name, "u1") for name in ("red", "green", "blue")]
-    rows = _rows([(axis, "<f4") for axis in "xyz"] + rgb, vertices, colors)
-    lines = _rows([("vertex1", "<i4"), ("vertex2", "<i4"), *rgb], edges, edge_colors)
-    tables = [("vertex", rows), ("edge", lines)]
-    write_ply(path, tables, comment=f"unit: {unit}; uwsfm")
-
-
-def _rows(
-    fields: list[tuple[str, str]], values: list, colors: list[NDArray[np.uint8]]
-) -> np.ndarray:
-    columns = np.concatenate(values)
-    rgb = np.concatenate(colors)
-    rows = np.zeros(len(columns), dtype=fields)
-    for index in range(columns.shape[1]):
-        rows[fields[index][0]] = columns[:, index]
-    for index in range(3):
-        rows[fields[columns.shape[1] + index][0]] = rgb[:, index]
+def _rows(fields: list[tuple[str, str]], *values: list) -> np.ndarray:
+    """Columns of numbers, those of each list side by side, as a structured array."""
+    columns = [column for part in values for column in np.concatenate(part).T]
+    rows = np.zeros(len(columns[0]), dtype=fields)
+    for (name, _), column in zip(fields, columns, strict=True):
+        rows[name] = column
     return rows

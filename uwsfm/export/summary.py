@@ -29,6 +29,7 @@ from uwsfm.models.lens import param_slots
 from uwsfm.models.port import DomePort, FlatPort, NoPort
 from uwsfm.residuals import border
 from uwsfm.rig import Rig, RigCamera
+from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD
 
 PACKAGES = (
@@ -153,6 +154,7 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
     errors = np.linalg.norm(scene.residuals(), axis=1)
     return {
         "num_registered_frames": calibration.scene.num_frames,
+        "num_registered_images": _num_images(scene),
         "num_points": scene.num_points,
         "num_observations": scene.num_observations,
         "num_invalid": int(np.count_nonzero(~np.isfinite(errors))),
@@ -164,6 +166,11 @@ def errors_summary(calibration: CalibrationResult) -> dict[str, Any]:
         "solves": [asdict(solve) for solve in summary.solves],
         "scale": scale_summary(calibration),
     }
+
+
+def _num_images(scene: Scene) -> int:
+    """Images that see a point."""
+    return len(np.unique(scene.camera_idx * scene.num_frames + scene.frame_idx))
 
 
 def scale_summary(calibration: CalibrationResult) -> dict[str, Any]:
@@ -207,13 +214,16 @@ def _positions_summary(
         return None
     miss = np.linalg.norm(fit.misses_m, axis=1)
     turn, axis = fit.turn
-    place = np.sqrt(np.diag(fit.covariance)[3:])
+    place = np.sqrt(np.diag(fit.covariance)[3:]).tolist()
     return {
         "num_positions": len(fit.inliers),
         "outliers": [frame_names[f] for f in fit.frame_idx[~fit.inliers]],
         "rms_miss_m": float(np.sqrt(np.mean(miss[fit.inliers] ** 2))),
         "scatter": fit.scatter,
-        "place_stddev_m": place.tolist(),
+        "place_stddev_m": [
+            value if known else None
+            for value, known in zip(place, fit.measured, strict=True)
+        ],
         "turn_stddev_deg": math.degrees(turn),
         "turn_axis": axis.tolist(),
     }

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -21,6 +22,14 @@ MUCH_BETTER = 2.0
 """Times less in squares. Of 3800 simulated tracks of 4 to 10 places, clean or a third
 of them wrong, none seemed mirrored; of mirrored ones that are not flat, nearly half
 of those of five places are told, and nine in ten of those of ten."""
+
+
+HEIGHT_ROUNDS = 30
+HEIGHT_FLOOR = 1e-2
+"""Of the median miss: below it, misses weigh alike."""
+FLAT_SHARE = 1e-6
+"""Of the largest variance: places whose smallest is less lie in a plane, or on a
+line (a millimetre over a metre)."""
 
 
 class Similarity(NamedTuple):
@@ -121,6 +130,84 @@ def fits_mirrored(x: Array, y: Array, covariances: Array, *, with_scale: bool) -
         for found in as_given
     )
     return cost > max(MUCH_BETTER * image_cost, image_cost + LIMIT_CHI2_3)
+
+
+def align_heights(
+    x: Array, heights: Array, up: Array, *, with_scale: bool
+) -> Similarity:
+    """Alignment of places to their heights alone: the tilt, and the height of zero.
+
+    The least sum of |s u.x + t - h| over unit vectors u, by reweighted least squares: a
+    tenth of the heights may be wrong. The heading is that of the smallest turn, and the
+    middle of the places is put at x = y = 0.
+
+    Args:
+        x: (N, 3) places.
+        heights: (N,) upwards.
+        up: (3,) roughly upwards in the frame of x. Heights of places in a plane leave
+            two tilts; the one nearer to this is taken.
+        with_scale: else the scale is 1, as where places in a plane leave it open.
+    """
+    weights = np.ones(len(x))
+    for _ in range(HEIGHT_ROUNDS):
+        share = weights / weights.sum()
+        middle, level = share @ x, share @ heights
+        root = np.sqrt(share)[:, None]
+        rows, wanted = root * (x - middle), root[:, 0] * (heights - level)
+        u, scale = _upward(rows, wanted, up, with_scale)
+        miss = scale * (x - middle) @ u - (heights - level)
+        typical = float(np.median(np.abs(miss)))
+        weights = 1.0 / np.maximum(np.abs(miss), HEIGHT_FLOOR * typical + 1e-12)
+    axis = np.cross(u, [0.0, 0.0, 1.0])
+    angle = np.arctan2(np.linalg.norm(axis), u[2])
+    if np.linalg.norm(axis) < 1e-12:
+        axis = np.array([1.0, 0.0, 0.0])
+    turn = rigid3.quat_from_rotvec(angle * axis / np.linalg.norm(axis))
+    rotation = np.concatenate([turn, np.zeros(3)])
+    shift = [0.0, 0.0, level] - scale * rigid3.rotate(rotation, middle)
+    shift[:2] = -scale * rigid3.rotate(rotation, x.mean(axis=0))[:2]
+    return Similarity(scale, np.concatenate([turn, shift]))
+
+
+def _upward(
+    rows: Array, wanted: Array, up: Array, with_scale: bool
+) -> tuple[Array, float]:
+    """The unit vector u (3,) and scale of the least squares of rows s u = wanted.
+
+    Of a unit vector, (A'A + lam) u = A'b with the lam that makes it one (secular
+    equation; Gander 1981).
+    """
+    values, axes = np.linalg.eigh(rows.T @ rows)
+    values = np.maximum(values, 1e-3 * FLAT_SHARE * values[2])
+    pull = axes.T @ (rows.T @ wanted)
+    flat = values[0] < FLAT_SHARE * values[2]
+    if with_scale and not flat:
+        u = axes @ (pull / values)
+        length = float(np.linalg.norm(u))
+        return u / length, length
+    parts = np.zeros(3)
+    firm = values > FLAT_SHARE * values[2]
+    parts[firm] = pull[firm] / values[firm]
+    if not firm.all() and np.linalg.norm(parts) < 1.0:
+        # What the places do not show fills up the length, towards `up`.
+        rest = axes[:, ~firm] @ (axes[:, ~firm].T @ up)
+        parts = axes @ parts
+        missing = np.sqrt(1.0 - parts @ parts)
+        u = parts + missing * rest / max(float(np.linalg.norm(rest)), 1e-12)
+        return u / np.linalg.norm(u), 1.0
+
+    def excess(lam: float) -> float:
+        return float(np.linalg.norm(pull / (values + lam))) - 1.0
+
+    low = -values[0] * (1.0 - 1e-9)
+    high = float(np.linalg.norm(pull)) + values[2]
+    if excess(low) <= 0.0:
+        u = axes @ (pull / (values + low))
+        rest = axes[:, 0] * np.sign(axes[:, 0] @ up)
+        u = u + np.sqrt(max(0.0, 1.0 - u @ u)) * rest
+    else:
+        u = axes @ (pull / (values + brentq(excess, low, high)))
+    return u / np.linalg.norm(u), 1.0
 
 
 def _align(

@@ -51,12 +51,21 @@ def verdict_of(summary: dict[str, Any]) -> Conclusions:
         reasons=tuple((r["severity"], r["text"]) for r in summary.get("reasons", ())),
         metric=_metric(summary),
         metric_word=summary["scale"]["verdict"],
-        fit=f"{registered} of {frames} frames are registered, with {points} points "
+        fit=f"{registered} of {frames} frames are registered{_images(summary)}, with "
+        f"{points} points "
         f"seen in {count} observations. The adjustment brought their true reprojection "
         f"error from {rms['before']:.3g} to {rms['after']:.3g} px RMS.",
         ports=tuple(_port(camera, summary) for camera in summary["cameras"]),
         open=tuple(_sentence(text) for text in summary["warnings"]),
     )
+
+
+def _images(summary: dict[str, Any]) -> str:
+    """How many images that is, where some are missing."""
+    total = summary.get("num_images")  # none in results of earlier versions
+    if total is None or summary["num_registered_images"] == total:
+        return ""
+    return f" ({summary['num_registered_images']} of {total} images)"
 
 
 def small_lengths(summary: dict[str, Any]) -> tuple[str, float]:
@@ -145,7 +154,9 @@ def position_words(summary: dict[str, Any]) -> str | None:
     if found is None:
         return None
     wrong = found["outliers"]
-    place = ", ".join(f"{value:.2g}" for value in found["place_stddev_m"])
+    place = ", ".join(
+        "-" if value is None else f"{value:.2g}" for value in found["place_stddev_m"]
+    )
     text = (
         f"{found['num_positions'] - len(wrong)} of {found['num_positions']} positions "
         f"are used; they miss the model by {found['rms_miss_m']:.3g} m RMS, "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as StillRunning
@@ -13,6 +15,7 @@ from zlib import error as BadCompression
 
 import pycolmap
 
+from uwsfm._disk import is_full
 from uwsfm.errors import UwsfmError
 
 Result = TypeVar("Result")
@@ -45,14 +48,25 @@ def opened(database_path: Path) -> Iterator[pycolmap.Database]:
     with quiet_colmap():
         try:
             database = pycolmap.Database.open(database_path)
-        except RuntimeError:
+        except RuntimeError as error:
+            if is_full(error):
+                raise
             raise damaged(database_path) from None
         with database:
             yield database
 
 
-def damaged(path: Path) -> UwsfmError:
-    """A file in the workspace is not what a step wrote."""
+def damaged(path: Path, error: BaseException | None = None) -> UwsfmError:
+    """A file in the workspace is not what a step wrote, or cannot be looked at.
+
+    Args:
+        path: the file.
+        error: what came of reading it.
+    """
+    if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
+        return UwsfmError(f"cannot read {path}: {error.strerror or error}")
+    if path.exists() and not os.access(path, os.R_OK):
+        return UwsfmError(f"cannot read {path}: {os.strerror(errno.EACCES)}")
     return UwsfmError(f"{path} is damaged: remove the folder {path.parent}, run again")
 
 

@@ -25,6 +25,7 @@ from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.background import quiet_colmap
 from uwsfm.sfm.images import natural_key
+from uwsfm.sfm.model_points import triangulated
 
 SPARSE = "sparse"
 """Where COLMAP and its programs keep the folders 0, 1, ... of their models."""
@@ -116,18 +117,33 @@ def _num_registered(folder: Path) -> int:
         return read_reconstruction(folder).num_reg_images()
 
 
-def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
+def read_image_model(
+    found: FoundModel, rig: Rig, database: Path | None = None
+) -> ImageModel:
     """Read a COLMAP model of raw images that lie in the folders of a rig.
 
+    Args:
+        found: The model.
+        rig: Its images are in the folders of this rig.
+        database: Of the model: where this has poses only, points come from its matches.
+
     Raises:
-        InputError: not a model; an empty one; an image that is in no folder of the rig,
-            of another size than its camera, or with a pose that is not finite; a camera
-            of the rig that has no image.
+        InputError: not a model; one without points and matches to make them from; an
+            image that is in no folder of the rig, of another size than its camera, or
+            with a pose that is not finite; a camera of the rig that has no image.
     """
     folder = found.folder
     with quiet_colmap():
         reconstruction = read_reconstruction(folder)
+    notes: tuple[str, ...] = ()
     images = _registered_images(folder, reconstruction)
+    if database is not None and not reconstruction.num_points3D():
+        reconstruction = triangulated(reconstruction, folder, database)
+        images = _registered_images(folder, reconstruction)
+        notes = (
+            f"the model has poses without points: {reconstruction.num_points3D()} were "
+            f"triangulated from the matches of {database}",
+        )
     places, warnings = _places(folder, [image.name for image in images], rig)
     _require_raw_images(folder, reconstruction, rig, images, places)
     names = sorted({name for _, name in places}, key=natural_key)
@@ -155,8 +171,9 @@ def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
     table = table[np.lexsort((table[:, 0], table[:, 1], table[:, 2]))]
     if not len(table):
         raise InputError(
-            f"{folder}: the model has poses, but no points that its images see: make "
-            "them first, for instance with COLMAP's point_triangulator"
+            f"{folder}: the model has poses, but no points that its images see: give "
+            "its database to uwsfm refine (--database), or make points with COLMAP's "
+            "point_triangulator"
         )
     if not np.isfinite(table[:, 6]).any():
         raise InputError(f"{folder}: every point lies behind the images that see it")
@@ -177,7 +194,7 @@ def read_image_model(found: FoundModel, rig: Rig) -> ImageModel:
         xy=table[:, 4:6].copy(),
         own_error_px=table[:, 6].copy(),
         keypoints=tuple(tuple(of_camera) for of_camera in keypoints),
-        warnings=(*found.warnings, *warnings),
+        warnings=(*found.warnings, *notes, *warnings),
     )
 
 

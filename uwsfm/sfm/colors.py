@@ -12,7 +12,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.background import DAMAGE, damaged
-from uwsfm.sfm.images import read_color
+from uwsfm.sfm.pixels import read_color
 
 Colors = NDArray[np.uint8]
 """(N, 3) RGB"""
@@ -69,8 +69,8 @@ def stored_point_colors(
         path = colors_path(colors_dir, image_names[camera][frame])
         try:
             return np.load(path)[keypoint_idx[rows]]
-        except (*DAMAGE, IndexError):
-            raise damaged(colors_dir) from None
+        except (*DAMAGE, IndexError) as error:
+            raise damaged(colors_dir, error) from None
 
     return _mean(scene, seen)
 

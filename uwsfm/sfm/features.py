@@ -12,18 +12,28 @@ from pathlib import Path
 
 import pycolmap
 
+from uwsfm._disk import require_room
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.rig import Rig
 from uwsfm.sfm import background
 from uwsfm.sfm.background import opened, quiet_colmap
 from uwsfm.sfm.colors import write_colors
-from uwsfm.sfm.image_features import ImageFeatures, find_features
+from uwsfm.sfm.image_features import (
+    FEATURE_BYTES,
+    ImageFeatures,
+    find_features,
+    scratch_bytes,
+)
 from uwsfm.sfm.images import Frames
 from uwsfm.sfm.options import FeatureOptions, thread_count
 
 CHUNK = 4
 """Images of one job: an interrupted run loses no more for each thread."""
+FINDING = "finding features"
+LEAST_SHARE = 0.1
+"""Of the features that images may have: fewer are found where there is hardly
+anything to see. Of others, the room is asked for as they come."""
 COLORS = "colors"  # folder of the keypoints' colours, beside the database
 
 
@@ -71,9 +81,10 @@ def extract_images(
 ) -> None:
     """`extract_features` of some frames, which may have none."""
     threads = thread_count(num_threads)
-    total = len(frames.folders) * len(frames.names)
+    total = frames.num_images
     sizes = {c.images: (c.camera.width, c.camera.height) for c in rig.cameras}
     stopped = threading.Event()
+    work_dir = database_path.parent
 
     def watch() -> None:
         if stopped.is_set():
@@ -81,13 +92,19 @@ def extract_images(
 
     def found(names: list[str]) -> list[ImageFeatures]:
         size = sizes[names[0].rpartition("/")[0]]
-        work_dir = database_path.parent
+        # Every thread may ask before any of them has written.
+        needed = threads * scratch_bytes(size, len(names), options)
+        require_room(work_dir, needed, FINDING)
         return find_features(frames.image_dir, names, size, options, work_dir, watch)
 
     with opened(database_path) as database, quiet_colmap():
         cameras = _cameras(database, frames, rig)
         chunks = _missing(database, frames)
-        done = total - sum(map(len, chunks))
+        missing = sum(map(len, chunks))
+        largest = max(options.num_features(*size) for size in sizes.values())
+        needed = LEAST_SHARE * missing * largest * FEATURE_BYTES
+        require_room(work_dir, needed, FINDING)
+        done = total - missing
         with ThreadPoolExecutor(threads) as pool:
             try:
                 # In order, so that the database is the same for any threads.
@@ -155,7 +172,7 @@ def _missing(database: pycolmap.Database, frames: Frames) -> list[list[str]]:
     for begin in range(0, len(frames.names), CHUNK):
         for c in range(len(frames.folders)):
             block = range(begin, min(begin + CHUNK, len(frames.names)))
-            names = [frames.image_name(c, f) for f in block]
+            names = [frames.image_name(c, f) for f in block if frames.has_image(c, f)]
             chunks.append([name for name in names if name not in there])
     return [names for names in chunks if names]
 

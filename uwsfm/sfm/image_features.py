@@ -8,7 +8,6 @@ lives as long as the job.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm._files import PARTIAL
+from uwsfm._partial import scratch_folder
 from uwsfm.errors import InputError
 from uwsfm.sfm.background import opened, run_with_database
 from uwsfm.sfm.colors import pixel_colors
-from uwsfm.sfm.images import read_color, size_fault
+from uwsfm.sfm.images import mask_path
 from uwsfm.sfm.options import FeatureOptions
+from uwsfm.sfm.pixels import read_color, size_fault
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +37,22 @@ class ImageFeatures:
     """(N, 128)"""
     colors: NDArray[np.uint8]
     """(N, 3) RGB of the pixel that holds the keypoint."""
+
+
+FEATURE_BYTES = 128 + 24 + 3
+"""A descriptor, a keypoint and its colour."""
+
+
+def scratch_bytes(
+    size: tuple[int, int], num_images: int, options: FeatureOptions
+) -> float:
+    """Room that `find_features` may take for a while, in bytes.
+
+    The images in grey, their masks, and a database with its journal.
+    """
+    num_features = options.num_features(*size)
+    pixels = size[0] * size[1] * (1 if options.mask_dir is None else 2)
+    return num_images * (pixels + 2 * num_features * FEATURE_BYTES)
 
 
 def find_features(
@@ -60,8 +76,8 @@ def find_features(
     Raises:
         InputError: an image cannot be decoded, or has another size; names it.
     """
-    with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=work_dir) as folder:
-        raw, path = Path(folder) / "raw", Path(folder) / "features.db"
+    with scratch_folder(work_dir) as folder:
+        raw, path = folder / "raw", folder / "features.db"
         raw.mkdir()
         images = []
         for k, name in enumerate(names):
@@ -72,7 +88,7 @@ def find_features(
                 raise InputError(fault)
             cv2.imwrite(str(raw / f"{k}.pgm"), _gray(image, options))
             if options.mask_dir is not None:
-                shutil.copyfile(options.mask_dir / f"{name}.png", raw / f"{k}.pgm.png")
+                _copy_mask(options.mask_dir, name, size, raw / f"{k}.pgm.png")
             images.append(image)
         reader = pycolmap.ImageReaderOptions()
         if options.mask_dir is not None:
@@ -97,6 +113,15 @@ def find_features(
                 _features(database, ids[f"{k}.pgm"], image)
                 for k, image in enumerate(images)
             ]
+
+
+def _copy_mask(mask_dir: Path, name: str, size: tuple[int, int], target: Path) -> None:
+    """The mask of an image, white where it has none: COLMAP wants one for each."""
+    source = mask_path(mask_dir, name)
+    if source is not None:
+        shutil.copyfile(source, target)
+    else:
+        cv2.imwrite(str(target), np.full(size[::-1], 255, dtype=np.uint8))
 
 
 def _gray(image: Any, options: FeatureOptions) -> NDArray[np.uint8]:

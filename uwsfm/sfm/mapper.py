@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import pycolmap
 
+from uwsfm._partial import scratch_folder
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.sfm.background import opened, run_watched
@@ -69,7 +69,7 @@ def map_images(
     def call(
         token: pycolmap.CancellationToken,
     ) -> dict[int, pycolmap.Reconstruction]:
-        with tempfile.TemporaryDirectory() as scratch:
+        with scratch_folder(mapping_path.parent) as scratch:
             return pycolmap.incremental_mapping(
                 mapping_path,
                 frames.image_dir,
@@ -80,7 +80,7 @@ def map_images(
                 cancellation_token=token,
             )
 
-    total = len(frames.names) * (len(frames.folders) if free else 1)
+    total = frames.num_images if free else len(frames.names)
     models = run_watched(call, lambda: progress("mapping", min(most, total), total))
     if not models:
         raise UwsfmError(_why_empty(mapping_path, frames))

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from uwsfm._disk import require_room
 from uwsfm._files import replaced_file
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
@@ -26,6 +27,8 @@ from uwsfm.sfm.images import Frames
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.pinhole_fit import VirtualPinhole
 
+COPIED_SHARE = 0.25
+"""Of the database of features: a keypoint has 24 bytes, a descriptor 128."""
 OFF_IMAGE = -1.0  # where keypoints without a water ray are put; they have no matches
 
 
@@ -84,6 +87,9 @@ def write_mapping_database(
         UwsfmError: no pair of images is left with verified matches.
     """
     remove_database(mapping_path)
+    # Keypoints, matches, and those of them that are verified; descriptors stay behind.
+    needed = COPIED_SHARE * features_path.stat().st_size
+    require_room(mapping_path.parent, needed, "verifying matches")
     with replaced_file(mapping_path) as partial:
         with (
             opened(features_path) as source,
@@ -100,6 +106,8 @@ def write_mapping_database(
                 poses = virtual_rig(cam_from_rig, pinholes)
                 configs = [rig_config(frames, poses)]
             pycolmap.apply_rig_config(configs, target)
+        # COLMAP's threads write what they verified; it cannot be more than there is.
+        require_room(mapping_path.parent, partial.stat().st_size, "verifying matches")
         _verify(partial, options, progress)
         with opened(partial) as target:
             if target.num_inlier_matches() == 0:
@@ -137,6 +145,8 @@ def _copy(
     source_id = {i.name: i.image_id for i in source.read_all_images()}
     for f in range(len(frames.names)):
         for c, (camera, pinhole) in enumerate(zip(cameras, pinholes, strict=True)):
+            if not frames.has_image(c, f):
+                continue
             name, image_id = frames.image_name(c, f), image_id_of(frames, c, f)
             old = source_id[name]
             xy = source.read_keypoints(old)[:, :2].astype(np.float64)

@@ -9,7 +9,6 @@ matches of a pair do not depend on the block it is in.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from uwsfm._files import PARTIAL
+from uwsfm._partial import scratch_folder
 from uwsfm.sfm.background import opened, run_with_database
 
 Pair = tuple[int, int]
@@ -69,6 +68,13 @@ def pair_blocks(
     return blocks
 
 
+def scratch_bytes(descriptors: Mapping[int, Descriptors], num_pairs: int) -> float:
+    """Room that `match_block` may take for a while, in bytes: a database with its
+    journal, and what all features of an image would match."""
+    rows = [len(of_image) for of_image in descriptors.values()]
+    return 2.0 * 136 * sum(rows) + 8.0 * num_pairs * max(rows, default=0)
+
+
 def match_block(
     descriptors: Mapping[int, Descriptors],
     pairs: Sequence[Pair],
@@ -88,10 +94,10 @@ def match_block(
         Matches for each pair, in the order of ``pairs``; none are verified.
     """
     report = watch or _nothing
-    with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=work_dir) as folder:
-        path = Path(folder) / "block.db"
+    with scratch_folder(work_dir) as folder:
+        path = folder / "block.db"
         _write_images(path, descriptors, {image for pair in pairs for image in pair})
-        list_path = Path(folder) / "pairs.txt"
+        list_path = folder / "pairs.txt"
         list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False

@@ -12,11 +12,18 @@ from pathlib import Path
 
 import pycolmap
 
+from uwsfm._disk import require_room
 from uwsfm._progress import Progress, silent
 from uwsfm.sfm import background
 from uwsfm.sfm.background import opened, quiet_colmap
 from uwsfm.sfm.images import Frames
-from uwsfm.sfm.match_blocks import Matches, Pair, match_block, pair_blocks
+from uwsfm.sfm.match_blocks import (
+    Matches,
+    Pair,
+    match_block,
+    pair_blocks,
+    scratch_bytes,
+)
 from uwsfm.sfm.options import MatchOptions, thread_count
 from uwsfm.sfm.paper_matching import match_pairs
 from uwsfm.sfm.retrieval import similar_frames
@@ -59,7 +66,7 @@ def image_pairs(
         for i, j in frame_pairs(len(frames.names), options, similar)
         for a in cameras
         for b in cameras
-        if i < j or a < b
+        if (i < j or a < b) and frames.has_image(a, i) and frames.has_image(b, j)
     ]
 
 
@@ -83,6 +90,7 @@ def chosen_pairs(
             lambda f: (
                 database.read_descriptors(ids[frames.image_name(c, f)]).data
                 for c in range(len(frames.folders))
+                if frames.has_image(c, f)
             ),
             num_frames,
             num_similar=options.num_similar,
@@ -165,6 +173,9 @@ def _match_with_colmap(
             used = {image for pair in blocks[k] for image in pair}
             with access:
                 descriptors = {i: database.read_descriptors(i).data for i in used}
+            # Every thread may ask before any of them has written.
+            needed = num_threads * scratch_bytes(descriptors, len(blocks[k]))
+            require_room(database_path.parent, needed, "matching")
             return match_block(descriptors, blocks[k], database_path.parent, watch)
 
         access = threading.Lock()  # to the connection, which is not for two threads

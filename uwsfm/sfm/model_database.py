@@ -6,8 +6,6 @@ water rays decide again, on all matches, which tracks there are and which frames
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,13 +18,13 @@ from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig import Rig
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import quiet_colmap
 from uwsfm.sfm.colmap_model import ImageModel, places_in_rig
 from uwsfm.sfm.images import natural_key
 from uwsfm.sfm.mapping.adjustment import adjust_locally, neighbours
 from uwsfm.sfm.mapping.correspondences import Correspondences, in_rows
 from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.mapping.registration import Ranking, register_next
+from uwsfm.sfm.model_points import copied_database
 from uwsfm.sfm.model_start import Tracks
 from uwsfm.sfm.refine import MAX_ERROR_PX, Refined
 from uwsfm.sfm.scene_points import MIN_ANGLE_DEG
@@ -58,19 +56,8 @@ def read_image_database(path: Path, model: ImageModel, rig: Rig) -> ImageDatabas
     Raises:
         InputError: not a database, or one of other images or features.
     """
-    if not path.is_file():
-        raise InputError(f"database {path} does not exist")
-    # Opening a database writes, and may bring it to COLMAP's present format.
-    with tempfile.TemporaryDirectory() as folder, quiet_colmap():
-        copy = Path(folder) / "database.db"
-        for suffix in ("", "-wal"):
-            if Path(f"{path}{suffix}").is_file():
-                shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
-        try:
-            with pycolmap.Database.open(copy) as database:
-                return _read(path, database, model, rig)
-        except RuntimeError as error:
-            raise InputError(f"{path} is not a COLMAP database: {error}") from None
+    with copied_database(path) as database:
+        return _read(path, database, model, rig)
 
 
 def _read(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -226,7 +227,7 @@ def _scale(
             f"{model.folder}: no frame has a registered image of "
             f"{rig.cameras[0].name!r} and one of another camera under the same name: "
             "the baseline cannot give the model its scale (images of one frame have "
-            "equal names)"
+            f"equal names{_suffix_hint(model)})"
         )
     if max(ratios) > MAX_SCALE_RATIO * min(ratios):
         raise InputError(
@@ -244,6 +245,19 @@ def _scale(
     if 1.0 / PLAUSIBLY_METRIC < scale < PLAUSIBLY_METRIC:
         note += ": if the model was in metres, one of the two is wrong"
     return scale, [note]
+
+
+def _suffix_hint(model: ImageModel) -> str:
+    """Two frames that would be one but for the suffixes of their images, or ''."""
+    of_stem: dict[str, str] = {}
+    for name in model.frame_names:
+        other = of_stem.setdefault(PurePosixPath(name).stem, name)
+        if other != name:
+            return (
+                f"; {other} and {name} differ by their suffix only: save all images "
+                "in one format, or rename them in the model"
+            )
+    return ""
 
 
 def _in_model(found: Sequence[_Pairs], rig: Rig, scale: float) -> Array:

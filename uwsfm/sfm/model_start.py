@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,10 @@ class ModelStart:
 
 
 def start_from_model(
-    found: FoundModel, rig: Rig, scene_distance_m: float = 1.0
+    found: FoundModel,
+    rig: Rig,
+    scene_distance_m: float = 1.0,
+    database: Path | None = None,
 ) -> ModelStart:
     """Read a COLMAP model, check it against a rig, and put it into metres.
 
@@ -60,11 +64,12 @@ def start_from_model(
         rig: Lenses in air, initial ports, and the baseline that gives the scale.
         scene_distance_m: Of the scene of a single camera, about; it sets the scale to
             start with.
+        database: As of `read_image_model`.
 
     Raises:
         InputError: as `read_image_model` and `rig_of_model`.
     """
-    model = read_image_model(found, rig)
+    model = read_image_model(found, rig, database)
     agreed = rig_of_model(model, rig, scene_distance_m)
     scene = Scene.from_arrays(
         cameras=rig.refractive_cameras(),

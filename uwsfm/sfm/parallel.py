@@ -8,7 +8,6 @@ it found goes to a file of the workspace, and this process alone writes the data
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +15,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from uwsfm._disk import require_room
 from uwsfm._files import replaced_file
+from uwsfm._partial import scratch_folder
 from uwsfm._progress import Progress, silent
 from uwsfm.rig import Rig
 from uwsfm.sfm.background import DAMAGE, damaged, opened, remove_database
 from uwsfm.sfm.features import COLORS, extract_images, require_features
 from uwsfm.sfm.images import Frames
-from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks
+from uwsfm.sfm.match_blocks import Pair, match_block, pair_blocks, scratch_bytes
 from uwsfm.sfm.matching import chosen_pairs
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 from uwsfm.sfm.steps import fingerprint
@@ -84,8 +85,8 @@ def extract_block(
     frames: Frames, rig: Rig, path: Path, options: FeatureOptions
 ) -> None:
     """Features of some frames in a database of their own."""
-    with tempfile.TemporaryDirectory() as own:
-        database_path = Path(own) / "block.db"
+    with scratch_folder() as own:
+        database_path = own / "block.db"
         colors_dir = path.parent.parent / COLORS
         extract_images(frames, rig, database_path, colors_dir, options, num_threads=1)
         with replaced_file(path) as partial:
@@ -155,8 +156,8 @@ def match_elsewhere(
             try:
                 with np.load(path) as stored:
                     matches = [stored[name] for name in stored.files]
-            except DAMAGE:
-                raise damaged(path) from None
+            except DAMAGE as error:
+                raise damaged(path, error) from None
             for (a, b), found in zip(block, matches, strict=True):
                 database.write_matches(a, b, found)
     shutil.rmtree(folder)
@@ -168,8 +169,9 @@ def match_task(folder: Path, block: Sequence[Pair], path: Path) -> None:
         image: np.load(_descriptors_path(folder, image))
         for image in sorted({image for pair in block for image in pair})
     }
-    with tempfile.TemporaryDirectory() as own:
-        found = match_block(descriptors, block, Path(own))
+    with scratch_folder() as own:
+        require_room(own, scratch_bytes(descriptors, len(block)), "matching")
+        found = match_block(descriptors, block, own)
     with replaced_file(path) as partial, partial.open("wb") as file:
         np.savez(file, *found)
 

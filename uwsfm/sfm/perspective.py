@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from uwsfm._files import replaced_dir
+from uwsfm.colmap import write_model
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -101,7 +102,7 @@ def write_start(
         "summary": summary,
     }
     with replaced_dir(model_path) as partial:
-        model.write(partial)
+        write_model(model, partial)
         text = json.dumps(content, indent=1)
         (partial / START_FILE).write_text(text, encoding="utf-8")
 
@@ -116,8 +117,8 @@ def load_start(
     """
     try:
         content = json.loads((model_path / START_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise damaged(model_path / START_FILE) from None
+    except (OSError, ValueError) as error:
+        raise damaged(model_path / START_FILE, error) from None
     pinholes = []
     for entry in content["pinholes"]:
         entry["center_in_cam"] = np.array(entry["center_in_cam"])
@@ -145,12 +146,14 @@ def read_start(start: PerspectiveStart) -> StartArrays:
         model = pycolmap.Reconstruction(start.model_path)
     except (RuntimeError, ValueError, MemoryError):
         raise damaged(start.model_path) from None
+    cameras = range(len(frames.folders))
     frame_of: dict[int, int] = {}  # index in `frames` -> COLMAP's frame id
     for frame_id in model.reg_frame_ids():
         ids = [data_id.id for data_id in model.frames[frame_id].image_ids]
-        if len(ids) != len(frames.folders):
+        frame = indices_of(frames, ids[0])[1]
+        if len(ids) != sum(frames.has_image(c, frame) for c in cameras):
             raise UwsfmError(f"frame {frame_id} of {start.model_path} lacks an image")
-        frame_of[indices_of(frames, ids[0])[1]] = frame_id
+        frame_of[frame] = frame_id
     registered = sorted(frame_of)
     index_of = {f: index for index, f in enumerate(registered)}
     # The virtual rig's frame is the reference camera's, moved to its virtual centre.
@@ -194,21 +197,25 @@ def _observation_table(
 def real_keypoints(
     features_path: Path, frames: Frames, registered: Sequence[int]
 ) -> tuple[tuple[Array, ...], ...]:
-    """[camera][frame] -> (n, 2) keypoints of some frames, from their database.
+    """[camera][frame] -> (n, 2) keypoints of some frames, from their database; none of
+    an image that is not there.
 
     Raises:
         UwsfmError: the database lacks an image.
     """
     with opened(features_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
+
+        def keypoints(c: int, f: int) -> Array:
+            if not frames.has_image(c, f):
+                return np.empty((0, 2))
+            stored = database.read_keypoints(ids[frames.image_name(c, f)])
+            return stored[:, :2].astype(np.float64)
+
         try:
-            wanted = [
-                [ids[frames.image_name(c, f)] for f in registered]
+            return tuple(
+                tuple(keypoints(c, f) for f in registered)
                 for c in range(len(frames.folders))
-            ]
+            )
         except KeyError:
             raise damaged(features_path) from None
-        return tuple(
-            tuple(database.read_keypoints(i)[:, :2].astype(np.float64) for i in camera)
-            for camera in wanted
-        )

@@ -10,7 +10,6 @@ in air, keypoints the raw ones and poses those of the real cameras: as here.
 """
 
 import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -19,6 +18,7 @@ import numpy as np
 import pycolmap
 
 from uwsfm._files import read_text
+from uwsfm._partial import scratch_folder
 from uwsfm.colmap import read_reconstruction
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
@@ -145,20 +145,20 @@ def read_refractive_colmap(
     """
     folder = Path(folder)
     cameras = read_refractive_cameras(folder / CAMERAS)
-    with tempfile.TemporaryDirectory() as name:
+    with scratch_folder() as plain:
         for other in (IMAGES, POINTS):
             if not (folder / other).is_file():
                 raise InputError(f"{folder / other}: no such file")
-            shutil.copy(folder / other, name)
+            shutil.copy(folder / other, plain)
         text = "".join(
             camera_line(number, PortCamera(camera=entry.camera, port=NoPort()))
             for number, entry in cameras.items()
         )
-        (Path(name) / CAMERAS).write_text(text, encoding="ascii")
+        (plain / CAMERAS).write_text(text, encoding="ascii")
         try:
-            return read_reconstruction(Path(name)), cameras
+            return read_reconstruction(plain), cameras
         except InputError as error:
-            raise InputError(str(error).replace(name, str(folder))) from None
+            raise InputError(str(error).replace(str(plain), str(folder))) from None
 
 
 def rig_of_refractive_colmap(path: str | Path) -> Rig:

@@ -121,6 +121,8 @@ def _agreeing(
     (a, b), cameras = pair, rig.refractive_cameras()
     rows = []
     for first, second in steps:
+        if not (frames.has_image(a, first) and frames.has_image(b, second)):
+            continue
         id_a, id_b = (
             ids[frames.image_name(a, first)],
             ids[frames.image_name(b, second)],

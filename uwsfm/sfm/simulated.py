@@ -23,7 +23,6 @@ def frames_of(rig: Rig, num_frames: int, image_dir: Path) -> Frames:
         image_dir=image_dir,
         folders=tuple(camera.images for camera in rig.cameras),
         names=tuple(f"{index:04d}.png" for index in range(num_frames)),
-        unmatched=(),
     )
 
 
@@ -36,7 +35,7 @@ def write_features(
 
     Args:
         path: of the database.
-        scene: observations.
+        scene: observations, none of them in an image that is not there.
         frames: names of the images.
         wrong: fraction of wrong matches.
         seed: of the wrong matches.
@@ -61,6 +60,8 @@ def write_features(
             )
             database.write_camera(lens, use_camera_id=True)
         for (c, f), rows, new_id in zip(images, rows_of, image_id, strict=True):
+            if not frames.has_image(c, f):
+                continue
             name = frames.image_name(c, f)
             image = pycolmap.Image(name=name, camera_id=c + 1, image_id=new_id)
             database.write_image(image, use_image_id=True)

@@ -20,7 +20,14 @@ from uwsfm.sfm.background import remove_database
 from uwsfm.sfm.baseline import rig_from_baseline
 from uwsfm.sfm.features import extract_features, store_intrinsics
 from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
-from uwsfm.sfm.images import Frames, check_masks, find_frames
+from uwsfm.sfm.images import (
+    Frames,
+    check_masks,
+    find_frames,
+    mask_path,
+    mask_warnings,
+    range_warnings,
+)
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.matching import clear_matches, match_features
@@ -145,6 +152,8 @@ def start_from_matches(
         )
         start = load_start(space.perspective, space.features, frames)
     start.summary["timings_s"] = steps.seconds()
+    start.summary["warnings"] += mask_warnings(frames, options.features.mask_dir)
+    start.summary["warnings"] += range_warnings(frames)
     start.summary["steps_of_earlier_runs"] = steps.of_earlier_runs()
     return start
 
@@ -231,8 +240,8 @@ def match_images(
 def _mask_content(frames: Frames, options: FeatureOptions) -> list[Any]:
     if options.mask_dir is None:
         return []
-    masks = (Path(options.mask_dir) / f"{name}.png" for name in frames.image_names())
-    found = [(mask, mask.stat()) for mask in masks if mask.exists()]
+    masks = (mask_path(options.mask_dir, name) for name in frames.image_names())
+    found = [(mask, mask.stat()) for mask in masks if mask is not None]
     return [[str(mask), stat.st_size, stat.st_mtime_ns] for mask, stat in found]
 
 

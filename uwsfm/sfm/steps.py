@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import PARTIAL, replaced_file
+from uwsfm._files import replaced_file
+from uwsfm._partial import remove_stale
 from uwsfm.sfm.background import damaged
 
 FILE_NAME = "steps.json"
@@ -56,7 +56,7 @@ class Steps:
     def __init__(self, work_dir: Path) -> None:
         self.work_dir = work_dir
         work_dir.mkdir(parents=True, exist_ok=True)
-        _remove_partial_outputs(work_dir)
+        remove_stale(work_dir, deep=True)
         self._path = work_dir / FILE_NAME
         self._records: dict[str, dict[str, Any]] = {}
         self._ran: set[str] = set()
@@ -131,12 +131,3 @@ class Steps:
         content = {"format": FORMAT, "steps": self._records}
         with replaced_file(self._path) as partial:
             partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
-
-
-def _remove_partial_outputs(work_dir: Path) -> None:
-    """What `replaced_file` and `replaced_dir` of a killed process could not remove."""
-    for path in work_dir.glob(f"{PARTIAL}*"):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()

@@ -141,9 +141,12 @@ def read_correspondences(
     rows = []
     with opened(features_path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        for name in frames.image_names():
-            xy = database.read_keypoints(ids[name])[:, :2].astype(np.float64)
-            rows.append(xy.reshape(-1, 2))
+        for f, c in np.ndindex(num_frames, num_cameras):
+            xy = np.empty((0, 2))
+            if frames.has_image(c, f):
+                stored = database.read_keypoints(ids[frames.image_name(c, f)])
+                xy = stored[:, :2].astype(np.float64).reshape(-1, 2)
+            rows.append(xy)
     counts = np.array([len(xy) for xy in rows])
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 

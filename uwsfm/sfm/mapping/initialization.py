@@ -199,11 +199,17 @@ def _ranked_frames(empty: GrowingMap, max_error_px: float) -> list[int]:
 
 
 def _ranked_pairs(empty: GrowingMap) -> list[tuple[int, int, int]]:
-    """Two frames and the number of their verified matches, the most first."""
+    """Two frames and the number of their verified matches, the most first.
+
+    Of a rig, both have images of two cameras: one alone gives the motion no length.
+    """
     of = empty.correspondences
     frames = of.frame[of.matches[of.verified]]
     keys = frames[:, 0] * np.int64(of.num_frames) + frames[:, 1]
-    pairs, counts = np.unique(keys[frames[:, 0] != frames[:, 1]], return_counts=True)
+    images = (np.diff(of.first) > 0).reshape(of.num_frames, of.num_cameras)
+    whole = images.sum(axis=1) >= min(2, of.num_cameras)
+    useful = (frames[:, 0] != frames[:, 1]) & whole[frames].all(axis=1)
+    pairs, counts = np.unique(keys[useful], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= MIN_POINTS]
     return [(*divmod(int(pairs[k]), of.num_frames), int(counts[k])) for k in order]

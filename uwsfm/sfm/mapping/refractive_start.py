@@ -70,8 +70,8 @@ class RefractiveStart:
         """
         try:
             stored = {n: np.load(self.map_path / f"{n}.npy") for n in ARRAYS}
-        except DAMAGE:
-            raise damaged(self.map_path) from None
+        except DAMAGE as error:
+            raise damaged(self.map_path, error) from None
         registered = stored["registered"].tolist()
         keypoints = real_keypoints(self.features_path, self.frames, registered)
         camera, frame = stored["camera_idx"], stored["frame_idx"]
@@ -130,8 +130,8 @@ def load_refractive_start(
     """
     try:
         content = json.loads((path / START_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise damaged(path / START_FILE) from None
+    except (OSError, ValueError) as error:
+        raise damaged(path / START_FILE, error) from None
     return RefractiveStart(
         map_path=path,
         features_path=features_path,

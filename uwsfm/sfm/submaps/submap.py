@@ -131,5 +131,5 @@ def read_submaps(path: Path) -> list[Submap]:
                 Submap(*(stored[f"{index}.{name}"] for name in Submap._fields))
                 for index in range(count)
             ]
-    except DAMAGE:
-        raise damaged(path) from None
+    except DAMAGE as error:
+        raise damaged(path, error) from None

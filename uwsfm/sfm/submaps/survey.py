@@ -98,5 +98,5 @@ def _read_parts(path: Path) -> list[IndexArray]:
     try:
         with np.load(path) as stored:
             return [stored[name] for name in stored.files]
-    except DAMAGE:
-        raise damaged(path) from None
+    except DAMAGE as error:
+        raise damaged(path, error) from None
