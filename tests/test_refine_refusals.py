@@ -147,6 +147,9 @@ def test_folders_without_a_usable_model_are_refused(dive, plain, tmp_path):
         with pytest.raises(uwsfm.InputError, match=words):
             uwsfm.refine_model(folder, dive.rig, out)
 
+    with pytest.raises(uwsfm.InputError, match="folder of the model itself"):
+        uwsfm.refine_model(plain, dive.rig, plain)
+    assert not (plain / "uwsfm-work").exists()
     refused(tmp_path / "none", "does not exist")
     refused(tmp_path, "holds no COLMAP model")
     pycolmap.Reconstruction().write_binary(str(tmp_path))

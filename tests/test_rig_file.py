@@ -208,9 +208,17 @@ MISTAKES = [
     (LENS + "width_px", 640.0, "width_px: must be a whole number, not 640.0"),
     (LENS + "width_px", 10**30, "width_px: must be at most 100000"),
     # units, signs, lengths
-    (PORT + "distance_m", 20, "distances are in metres, did you mean 0.020?"),
+    (
+        PORT + "distance_m",
+        20,
+        "0.020 (as millimetres) or 0.200 (as centimetres)?",
+    ),
     (PORT + "distance_m", -0.02, "-0.02 m is negative"),
-    (PORT + "thickness_m", 12.5, "thicknesses are in metres, did you mean 0.0125?"),
+    (
+        PORT + "thickness_m",
+        12.5,
+        "are in metres, did you mean 0.0125 (as millimetres) or 0.125 ",
+    ),
     (PORT + "normal", [0, 0, -1], "port.normal: points back at the camera"),
     (PORT + "normal", [0, 0, 2], "port.normal: must have length 1, has length 2"),
     (PORT + "normal", [0, 1], "port.normal: needs 3 values, got 2"),

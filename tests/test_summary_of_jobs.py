@@ -24,7 +24,6 @@ def start_of(model, **more):
         image_dir=Path("images"),
         folders=("left", "right"),
         names=(*model.frame_names, "0003.jpg", "0004.jpg"),
-        unmatched=(),
     )
     return RefractiveStart(
         map_path=Path("map"),

@@ -20,13 +20,20 @@ from uwsfm.check_halves import check_halves, cross_validated
 from uwsfm.cli import app
 from uwsfm.cli_check import halves_table
 from uwsfm.errors import InputError
+from uwsfm.export.files import HOUSING
 from uwsfm.export.halves_summary import KEY, halves_numbers
 from uwsfm.export.summary import housing_summary
 from uwsfm.geometry import rigid3
 from uwsfm.judgement import judged_result
 from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.residuals import border
-from uwsfm.result_folder import given_rig, open_result
+from uwsfm.result_folder import (
+    given_rig,
+    open_result,
+    require_model,
+    store_judgement,
+)
+from uwsfm.rig_file import load_rig
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -299,6 +306,30 @@ def test_halves_change_verdict_words_and_notes_of_a_stored_result(dive_result):
     assert sorted(again["warnings"]) == sorted(result.summary["warnings"])
 
 
+def test_housing_and_what_is_made_of_a_result_follow_its_new_verdict(
+    dive_result, tmp_path
+):
+    out = tmp_path / "out"
+    shutil.copytree(dive_result.out, out)
+    result = open_result(out)
+    (out / "cloud.json").write_text(json.dumps({"model": result.fingerprint}))
+    shown = enlarged(result.solved, {"distance": 50.0})
+    store_judgement(result, shown, "doubtful")
+    rig, old = load_rig(out / "housing.yaml"), load_rig(dive_result.out / HOUSING)
+    assert (old.verdict, rig.verdict) == ("fits", "doubtful")
+    known = shown.covariance.judged_cameras
+    for camera, before, cov in zip(rig.cameras, old.cameras, known, strict=True):
+        # Written with four digits.
+        assert camera.accuracy.distance_m == pytest.approx(
+            cov.distance_stddev_m, rel=1e-3
+        )
+        assert camera.accuracy.distance_m > 3.0 * before.accuracy.distance_m
+        assert camera.port == before.port
+    again = open_result(out)  # the checksums and the calibration's mark are its own
+    require_model(out / "cloud.ply", out, "make it again")
+    assert again.fingerprint != result.fingerprint
+
+
 def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
     """As the run itself did it; the table shows what the summary holds."""
     out = tmp_path / "out"
@@ -308,7 +339,7 @@ def test_a_folder_is_cross_validated_again(dive_result, tmp_path):
     (out / "summary.json").write_text(json.dumps(bare))
     shown = CliRunner().invoke(app, ["check", str(out), "--halves"])
     assert shown.exit_code == 0, shown.output
-    assert shown.output.startswith("Verdict: fits.")
+    assert shown.stdout.startswith("Verdict: fits.")
     numbers = check_halves(out)
     after = json.loads((out / "summary.json").read_text())
     assert after[KEY] == json.loads(json.dumps(numbers))

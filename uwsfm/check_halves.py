@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from uwsfm._progress import Progress, silent
 from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.error_budget import error_budget
 from uwsfm.errors import InputError
@@ -22,7 +23,7 @@ from uwsfm.export.verdict_summary import with_verdict
 from uwsfm.judgement import housing_warnings
 from uwsfm.report.files import write_report
 from uwsfm.report.gather import PAGE
-from uwsfm.result_folder import Result, given_rig, open_result
+from uwsfm.result_folder import Result, given_rig, open_result, store_judgement
 from uwsfm.rig import Rig
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate
@@ -30,15 +31,16 @@ from uwsfm.trust.halves_reason import halves_reasons, untested_notes
 from uwsfm.trust.verdict import judged, with_reasons
 
 
-def check_halves(out: str | Path) -> dict[str, Any]:
+def check_halves(out: str | Path, progress: Progress = silent) -> dict[str, Any]:
     """Cross-validate a result of any size.
 
     The summary of the result receives the comparison, and standard deviations that the
-    halves find too small are enlarged in its tables and notes; halves that differ far
-    are a reason of its verdict. A report is written again.
+    halves find too small are enlarged in its tables and notes, and in housing.yaml;
+    halves that differ far are a reason of its verdict. A report is written again.
 
     Args:
         out: folder that `reconstruct`, `refine_model` or `run_demo` wrote.
+        progress: called with the steps "adjusting halves" and "report".
 
     Returns:
         The comparison, as in ``summary.json`` under "cross_validation".
@@ -54,10 +56,13 @@ def check_halves(out: str | Path) -> dict[str, Any]:
             f"made this result; {RUN_AGAIN}"
         )
     given = given_rig(result.folder)
+    progress("adjusting halves", 0, None)
     found = cross_validate(given, result.solved)
     summary = cross_validated(result, given, found)
+    store_judgement(result, enlarged(result.solved, found.enlarged), summary["verdict"])
     write_json(summary, result.folder / SUMMARY)
     if (result.folder / PAGE).is_file():
+        progress("report", 0, None)
         write_report(result.folder)
     numbers: dict[str, Any] = summary[KEY]
     return numbers

@@ -63,11 +63,14 @@ def check(
 
 
 def _check_halves(out: Path) -> None:
-    from uwsfm.check_halves import check_halves
-    from uwsfm.console import console, print_verdict
+    from uwsfm._signals import BEGINS_AGAIN
+    from uwsfm.console import ProgressBars, console, print_verdict
     from uwsfm.export.files import SUMMARY, read_summary
 
-    found = check_halves(out)
+    with ProgressBars(BEGINS_AGAIN) as progress:
+        from uwsfm.check_halves import check_halves
+
+        found = check_halves(out, progress)
     summary = read_summary(out) or {}
     print_verdict({**summary, "explanations": ()})
     console.print(halves_table(found))

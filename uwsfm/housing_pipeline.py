@@ -32,6 +32,7 @@ from uwsfm.output_folder import (
     locked,
     made_of_files,
     output_folder,
+    require_elsewhere,
 )
 from uwsfm.pipeline import compiled, refined_rig, start_scene
 from uwsfm.rig import Rig
@@ -114,6 +115,7 @@ def calibrate_housing(
     # A wrong option fails before anything is written.
     require_effect(CalibrateOptions.parsed(merged))
     known = KnownLengths.read(lengths, positions, lever_arm)
+    require_elsewhere(out, source)
     source, out = Path(source), output_folder(out, made_of=made_of)
     if source.suffix == ".npz" and source.is_file():
         raise InputError(

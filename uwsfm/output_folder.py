@@ -47,6 +47,18 @@ def made_of_files(rig: object, source: str | Path) -> dict[str, str | None]:
     }
 
 
+def require_elsewhere(out: str | Path, source: str | Path) -> None:
+    """Refuse to write results among the files that they are made of.
+
+    Raises:
+        InputError: ``out`` is the folder ``source``.
+    """
+    if os.path.realpath(out) == os.path.realpath(source):
+        raise InputError(
+            f"{out} is the folder of the model itself: choose another for results"
+        )
+
+
 def output_folder(
     out: str | Path,
     images: str | Path | None = None,

@@ -33,7 +33,7 @@ from uwsfm.job_log import job_log
 from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
-from uwsfm.output_folder import locked, made_of_files, output_folder
+from uwsfm.output_folder import locked, made_of_files, output_folder, require_elsewhere
 from uwsfm.pipeline import compiled, export_points, refined_rig
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
@@ -140,6 +140,7 @@ def refine_model(
     require_effect(settings)
     distance_m = scene_distance(rig, scene_distance_m)
     made_of = made_of_files(rig_source, source)
+    require_elsewhere(out, source)
     source, out = Path(source), output_folder(out, images, made_of)
     found = _found(source)
     if out.exists() and _same_or_inside(found.folder, out / SPARSE):

@@ -29,6 +29,8 @@ from uwsfm.export.files import (
     read_summary,
 )
 from uwsfm.export.halves_summary import KEY
+from uwsfm.export.housing import export_housing
+from uwsfm.export.summary import write_json
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 
@@ -193,6 +195,26 @@ def store_calibration(calibration: CalibrationResult, out: Path) -> None:
     mark = fingerprint_of(out)
     write_calibration(calibration, out / CALIBRATION, mark)
     write_checksums(out, [*(out / SPARSE).iterdir(), out / HOUSING])
+
+
+def store_judgement(result: Result, shown: CalibrationResult, verdict: str) -> None:
+    """Write housing.yaml anew, with another verdict and the deviations that are shown.
+
+    What was made of the result stays its own: only what is said of it has changed.
+
+    Args:
+        result: as it is stored.
+        shown: its calibration with the deviations that a person reads.
+        verdict: on it.
+    """
+    out = result.folder
+    export_housing(result.model.rig, out / HOUSING, shown, verdict=verdict)
+    store_calibration(result.solved, out)
+    mark = fingerprint_of(out)
+    for path in out.glob("*.json"):
+        told = read_told(path)
+        if told.get("model") == result.fingerprint:
+            write_json({**told, "model": mark}, path)
 
 
 def recorded_images(images: Path | None) -> str | None:

@@ -29,10 +29,15 @@ def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float
     if value < 0:
         raise InputError(f"{value:g} m is negative; a {noun} cannot be")
     if value > limit and not IMPLAUSIBLE_ALLOWED.get():
-        guess = np.format_float_positional(float(f"{value / 1000:.6g}"), min_digits=3)
+        guesses = [
+            f"{np.format_float_positional(float(f'{value / per:.6g}'), min_digits=3)} "
+            f"(as {unit})"
+            for unit, per in (("millimetres", 1000.0), ("centimetres", 100.0))
+            if value / per <= limit
+        ]
         raise InputError(
             f"{value:g} m is not a {noun}; {plural} are in metres, "
-            f"did you mean {guess}?"
+            f"did you mean {' or '.join(guesses) or 'another number'}?"
         )
     return value
 

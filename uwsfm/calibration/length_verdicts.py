@@ -12,7 +12,7 @@ ASK_FOR_LENGTH = (
     "give a scale bar, a known distance between two frames, or positions of the frames"
 )
 # A scale better than this is worth printing lengths for.
-DETERMINED_SCALE, OPEN_SCALE = 0.05, 1.0
+DETERMINED_SCALE, OPEN_SCALE = 0.05, 0.5
 WEAK_TURN_DEG, OPEN_TURN_DEG = 2.0, 20.0
 # Standard deviations that a known length may be missed by.
 CONTRADICTION = 4.0

@@ -297,13 +297,13 @@ def _check_ports(state: State) -> None:
         offset = float(np.linalg.norm(row[:3]))
         if row[KIND] == DOME and not offset < row[3]:
             raise UwsfmError(
-                f"the dome of camera {camera} moved away, to a centre {offset:.3f} m "
-                f"from the camera at a radius of {row[3]:.3f} m: the start is too far "
-                "off, or the images do not determine the centre"
+                f"the dome of camera number {camera + 1} moved away, to a centre "
+                f"{offset:.3f} m from the camera at a radius of {row[3]:.3f} m: the "
+                "start is too far off, or the images do not determine the centre"
             )
         if row[KIND] == FLAT and not row[2] > 0.0:
             raise UwsfmError(
-                f"the port normal of camera {camera} turned away from the water, to "
-                f"({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the start is too far off "
-                "or cam_from_rig is wrong"
+                f"the port normal of camera number {camera + 1} turned away from the "
+                f"water, to ({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the start is "
+                "too far off or cam_from_rig is wrong"
             )

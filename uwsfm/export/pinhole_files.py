@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm._files import checked_target, replaced_dir
+from uwsfm._paths import inside
 from uwsfm._progress import Progress, silent
 from uwsfm.colmap import Model, to_reconstruction, write_model
 from uwsfm.errors import InputError
@@ -63,6 +64,8 @@ def export_pinhole(
         _check_images(model, Path(images))
     found = pinhole_model(model, centered=centered)
     names = image_names(model, flat=flat_names)
+    for name in names.values():  # before half of them are written
+        inside(target, name)
     reconstruction = to_reconstruction(found.model)
     written = {model.image_name(*place): name for place, name in names.items()}
     for image in reconstruction.images.values():

@@ -17,6 +17,8 @@ UNIT = 0.02
 """A fall of the RMS by so much, relative, counts one; so do the strains below."""
 CLEAR = 1.5
 """An explanation must be better than the rig as given by so many."""
+SURE = 6.0
+"""An explanation that is better by more is no coincidence."""
 TIE = 1.5
 """Explanations nearer than this to the best cannot be told apart."""
 HARDLY = 50.0
@@ -91,7 +93,22 @@ def explanations(base: Tried, tried: Iterable[Tried]) -> tuple[Explanation, ...]
     chosen.sort(key=lambda one: (one.fit.rms_px > limit, one.total))
     if not chosen:
         return _hardly(base, tried)
+    if base.total - chosen[0].total < SURE:
+        chosen += _contained(chosen, tried)
     return tuple(_explained(base, one) for one in chosen[:MAX_EXPLANATIONS])
+
+
+def _contained(chosen: Sequence[Tried], tried: Sequence[Tried]) -> list[Tried]:
+    """Coefficients that are free, beside an order of them that gains little: it may be
+    right by chance, where one of them is wrong and nobody mistook any order."""
+    codes = {one.trial.code for one in chosen}
+    if chosen[0].trial.code != "distortion_order" or "distortion" in codes:
+        return []
+    free = [one for one in tried if one.trial.code == "distortion"]
+    best = min(free, key=lambda one: one.total, default=None)
+    if best is None or best.misfit > chosen[0].misfit + AS_GOOD:
+        return []
+    return [best]
 
 
 def _hardly(base: Tried, tried: Sequence[Tried]) -> tuple[Explanation, ...]:

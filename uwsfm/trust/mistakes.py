@@ -334,8 +334,8 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
         code, words = _unit_of(factor)
         yield Trial(
             code=code,
-            what=f"the baseline is {rig.baseline_m / factor:.2g} m, and not "
-            f"{rig.baseline_m:.3g} m",
+            what=f"the baseline is roughly {rig.baseline_m / factor:.1g} m, by what "
+            f"the rig file says of the ports, and not {rig.baseline_m:.3g} m",
             remedy=f"check the unit of translation_m: {words}",
             rig=_shorter(rig, factor),
             handicap=0.0 if given < MAX_DISTANCE_M else RARE,
