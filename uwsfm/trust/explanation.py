@@ -24,6 +24,9 @@ TIE = 1.5
 HARDLY = 50.0
 """Chi-square that an explanation must save where none is clear: a dozen numbers save 45
 by chance once in 10^5 times. The verdict has found that something is wrong."""
+CLEAN_PX = 3.0
+"""With a larger RMS there are gross errors among the observations, and not chance but
+they decide about a per cent of it."""
 HARDLY_TIE = 0.25
 FREE_SHARE = 0.2
 """Of the handicap of numbers that are set free, where so little tells: two of them
@@ -113,6 +116,9 @@ def _contained(chosen: Sequence[Tried], tried: Sequence[Tried]) -> list[Tried]:
 
 def _hardly(base: Tried, tried: Sequence[Tried]) -> tuple[Explanation, ...]:
     """What explains the observations better by little, and yet by more than chance."""
+
+    if base.fit.rms_px > CLEAN_PX:
+        return ()
 
     def total(one: Tried) -> float:
         return one.total - (1.0 - FREE_SHARE) * one.trial.handicap
