@@ -36,8 +36,8 @@ def result(model):
         (None, "arbitrary"),
         (0.045, "determined"),
         (0.055, "weakly determined"),
-        (0.9, "weakly determined"),
-        (1.1, "not determined"),
+        (0.45, "weakly determined"),
+        (0.55, "not determined"),
         (math.nan, "not determined"),
         (math.inf, "not determined"),
     ],
@@ -50,7 +50,7 @@ def test_a_scale_is_determined_below_five_per_cent(stddev, word):
 
 def test_a_thousandth_of_an_arbitrary_length_is_no_millimetre():
     assert small_unit(None) == "1e-3, scale arbitrary"
-    assert small_unit(0.9) == small_unit(0.01) == "mm"
+    assert small_unit(0.45) == small_unit(0.01) == "mm"
 
 
 def scaled(result, own, in_all, **more):

@@ -315,8 +315,6 @@ def test_another_header_is_refused_with_the_right_one(tmp_path):
     with pytest.raises(InputError, match="the column 'lat' is in degrees"):
         load_positions(nav(tmp_path, [], "frame,lat,lon,z,sx,sy,sz"))
     with pytest.raises(InputError, match="or frame,depth,sdepth .* got 'a,b'"):
-        InputError, match="sx,sy,sz, or frame,depth,sdepth .* got 'a,b'"
-    ):
         load_positions(nav(tmp_path, [], "a,b"))
     rows = [f"{k},{k},2,3,1,1,1" for k in range(3)]
     assert (

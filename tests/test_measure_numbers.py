@@ -88,8 +88,8 @@ def scaled(result, stddev):
     [
         (0.045, None),
         (0.055, "the scale is weakly determined, 6 %, which all"),
-        (0.9, "the scale is weakly determined, 90 %, which all"),
-        (1.1, "nothing that is measured is determined"),
+        (0.45, "the scale is weakly determined, 45 %, which all"),
+        (0.55, "nothing that is measured is determined"),
         (None, "lengths and areas are in an arbitrary unit"),
     ],
 )
@@ -103,9 +103,9 @@ def test_a_note_says_how_well_the_scale_is_known(result, stddev, words):
     assert bool(found.warnings) == (words is not None)
     assert words is None or words in found.warnings[0]
     length, angle = found.measurements
-    assert (length.value is None) == (stddev == 1.1)
+    assert (length.value is None) == (stddev == 0.55)
     assert angle.value is not None  # a scale turns nothing
-    if stddev == 1.1:
+    if stddev == 0.55:
         assert length.notes[0] == "not determined by the images"
         assert length.stddev is length.stddev_alone is length.stddev_in_all is None
     assert found.unit == ("scale arbitrary" if stddev is None else "metre")

@@ -199,8 +199,10 @@ def test_a_model_is_not_overwritten_by_its_own_refinement(dive, tmp_path):
     export_colmap(dive.model, tmp_path / "sparse" / "0")
     (tmp_path / "uwsfm-work").mkdir()
     (tmp_path / "uwsfm-work" / "lock").touch()
-    with pytest.raises(uwsfm.InputError, match="which the result would replace"):
+    with pytest.raises(uwsfm.InputError, match="the folder of the model itself"):
         uwsfm.refine_model(tmp_path, dive.rig, tmp_path)
+    with pytest.raises(uwsfm.InputError, match="which the result would replace"):
+        uwsfm.refine_model(tmp_path / "sparse", dive.rig, tmp_path)
 
 
 def test_options_that_do_nothing_are_refused(dive, plain, tmp_path):

@@ -188,11 +188,11 @@ def test_errors_are_those_of_the_observations_that_took_part(model, result):
     ("own", "in_all", "expected"),
     [
         (0.013, 0.021, ("determined", 0.013, 0.021, "metre", "mm")),
-        # 5 % and 100 % are the limits, of the deviation in all.
+        # 5 % and 50 % are the limits, of the deviation in all.
         (0.013, 0.045, ("determined", 0.013, 0.045, "metre", "mm")),
         (0.013, 0.055, ("weakly determined", 0.013, 0.055, "metre", "mm")),
-        (0.013, 0.9, ("weakly determined", 0.013, 0.9, "metre", "mm")),
-        (0.013, 1.1, ("not determined", 0.013, 1.1, "metre", "mm")),
+        (0.013, 0.45, ("weakly determined", 0.013, 0.45, "metre", "mm")),
+        (0.013, 0.55, ("not determined", 0.013, 0.55, "metre", "mm")),
         (math.inf, 0.02, ("not determined", None, None, "metre", "mm")),
         (
             None,
