@@ -439,11 +439,11 @@ def test_a_large_scene_is_asked_by_some_of_its_frames(dive, monkeypatch):
     monkeypatch.setattr(freed_module, "MAX_OBSERVATIONS", 2000)
     monkeypatch.setattr(freed_module, "PART", 1500)
     right = refine_scene(replace(scene, cameras=rig.refractive_cameras()), rig)
-    found = freed_module.freed_lenses(right.calibration)
+    found = freed_module.freed_numbers(right.calibration).lenses
     part = freed_module._some_frames(right.scene)
     assert 1500 <= part.num_observations < right.scene.num_observations
     assert 1 < part.num_frames < scene.num_frames
     assert found.p_value > 1e-4
     lens = with_lens(with_lens(rig, 0, p1=0.006), 1, p1=0.006)
     wrong = refine_scene(replace(scene, cameras=lens.refractive_cameras()), lens)
-    assert freed_module.freed_lenses(wrong.calibration).p_value < LEVEL
+    assert freed_module.freed_numbers(wrong.calibration).lenses.p_value < LEVEL

@@ -35,9 +35,28 @@ _KINDS = {name: kind for kind, name in _NAMES.items()} | {
 _LITTLE = "format binary_little_endian 1.0"
 _BIG = "format binary_big_endian 1.0"
 _ASCII = "format ascii 1.0"
+XYZ = [(axis, "<f4") for axis in "xyz"]
+RGB = [(name, "u1") for name in ("red", "green", "blue")]
+"""Columns of points and of their colours."""
 _MAX_HEADER = 65_536
 _MAX_DIGITS = 18
 """Of a count: more vertices than any disk holds."""
+
+
+def stacked_rows(
+    fields: list[tuple[str, str]], *values: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Columns of numbers, those of each list side by side, as a structured array.
+
+    Args:
+        fields: name and kind of each column.
+        values: lists of arrays (N_k, K), which are put one below the other.
+    """
+    columns = [column for part in values for column in np.concatenate(part).T]
+    rows = np.zeros(len(columns[0]), dtype=fields)
+    for (name, _), column in zip(fields, columns, strict=True):
+        rows[name] = column
+    return rows
 
 
 def write_ply(

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwsfm._children import SAFE_PATH, import_path
 from uwsfm._cluster_keys import secrets_of
-from uwsfm._partial import partial_prefix
+from uwsfm._partial import scratch_folder
 from uwsfm._progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 
@@ -194,9 +194,7 @@ class Workers:
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
         # In a workspace, what a killed run could not remove is gone with the next.
-        scratch = processes.enter_context(
-            tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=self._folder)
-        )
+        scratch = str(processes.enter_context(scratch_folder(self._folder)))
         security = Security.temporary()
         common: dict[str, Any] = {
             "security": security,

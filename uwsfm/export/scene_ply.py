@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._files import checked_target
-from uwsfm._ply import write_ply
+from uwsfm._ply import RGB, XYZ, stacked_rows, write_ply
 from uwsfm.colmap import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -82,10 +82,11 @@ def export_scene_ply(
             edges.append(lines.edges + count)
             of_edges.append(lines.colors[lines.edges[:, 1]])
             count += len(lines.vertices)
-    rgb = [(name, "u1") for name in ("red", "green", "blue")]
-    rows = _rows([(axis, "<f4") for axis in "xyz"] + rgb, vertices, colors)
+    rows = stacked_rows(XYZ + RGB, vertices, colors)
     ends = [("vertex1", "<i4"), ("vertex2", "<i4")]
-    table = _rows(ends + rgb, edges, of_edges) if edge_colors else _rows(ends, edges)
+    table = stacked_rows(ends, edges)
+    if edge_colors:
+        table = stacked_rows(ends + RGB, edges, of_edges)
     tables = [("vertex", rows), ("edge", table)]
     write_ply(target, tables, comment=f"unit: {unit}; uwsfm")
 
@@ -142,12 +143,3 @@ def _joined(lines: list[Array], colors: list[NDArray[np.uint8]]) -> Lines:
         edges=new_index[edges].astype(np.int64),
         colors=np.repeat(np.array(colors, dtype=np.uint8), lengths, axis=0)[there],
     )
-
-
-def _rows(fields: list[tuple[str, str]], *values: list) -> np.ndarray:
-    """Columns of numbers, those of each list side by side, as a structured array."""
-    columns = [column for part in values for column in np.concatenate(part).T]
-    rows = np.zeros(len(columns[0]), dtype=fields)
-    for (name, _), column in zip(fields, columns, strict=True):
-        rows[name] = column
-    return rows

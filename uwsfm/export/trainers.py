@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._ply import write_ply
+from uwsfm._ply import RGB, XYZ, stacked_rows, write_ply
 from uwsfm.colmap import Model
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
@@ -120,10 +120,5 @@ def _intrinsics(model: Model, camera: int) -> dict[str, float]:
 
 
 def _write_points(path: Path, model: Model) -> None:
-    fields = [(axis, "<f4") for axis in "xyz"]
-    fields += [(color, "u1") for color in ("red", "green", "blue")]
-    table = np.empty(model.scene.num_points, dtype=fields)
-    columns = [*model.scene.points.T, *model.colors.T]
-    for (name, _), values in zip(fields, columns, strict=True):
-        table[name] = values
+    table = stacked_rows(XYZ + RGB, [model.scene.points], [model.colors])
     write_ply(path, [("vertex", table)], comment="points of the model; uwsfm")

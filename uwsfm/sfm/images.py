@@ -35,6 +35,8 @@ class Frames:
 
     def has_image(self, camera_idx: int, frame_idx: int) -> bool:
         """Whether a frame has an image of a camera."""
+        if not self.absent:  # no name is made for each of many pairs
+            return True
         return self.image_name(camera_idx, frame_idx) not in self.absent
 
     def places(self) -> Iterator[tuple[int, int]]:

@@ -116,7 +116,6 @@ def _contained(chosen: Sequence[Tried], tried: Sequence[Tried]) -> list[Tried]:
 
 def _hardly(base: Tried, tried: Sequence[Tried]) -> tuple[Explanation, ...]:
     """What explains the observations better by little, and yet by more than chance."""
-
     if base.fit.rms_px > CLEAN_PX:
         return ()
 
@@ -136,7 +135,9 @@ def _hardly(base: Tried, tried: Sequence[Tried]) -> tuple[Explanation, ...]:
         near = total(one) - total(better[0]) <= HARDLY_TIE
         if near and all(one.trial.code != other.trial.code for other in chosen):
             chosen.append(one)
-    return tuple(_explained(base, one, "Perhaps") for one in chosen[:MAX_EXPLANATIONS])
+    return tuple(
+        _explained(base, one, clear=False) for one in chosen[:MAX_EXPLANATIONS]
+    )
 
 
 def _of_fewest_cameras(best: Tried, better: Iterable[Tried]) -> Tried:
@@ -155,10 +156,10 @@ def _of_fewest_cameras(best: Tried, better: Iterable[Tried]) -> Tried:
     return min(as_good, key=rank)
 
 
-def _explained(base: Tried, one: Tried, word: str = "Probably") -> Explanation:
+def _explained(base: Tried, one: Tried, *, clear: bool = True) -> Explanation:
     before, after = base.fit.rms_px, one.fit.rms_px
     evidence = [f"the RMS error {OF_WHAT} falls from {before:.2f} to {after:.2f} px"]
-    if word == "Perhaps":
+    if not clear:
         evidence = [
             f"the RMS error {OF_WHAT} falls from {before:.4g} to {after:.4g} px, which "
             "is more than chance, but little"
@@ -167,6 +168,7 @@ def _explained(base: Tried, one: Tried, word: str = "Probably") -> Explanation:
         evidence = [f"the RMS error {OF_WHAT} stays at {after:.2f} px"]
     evidence += [*_port_evidence(base, one), *_turn_evidence(base, one)]
     told, remedy = one.trial.estimate(one.fit), one.trial.remedy
+    word = "Probably" if clear else "Perhaps"
     return Explanation(
         code=one.trial.code,
         text=f"{word} {one.trial.what}{told}. Without this mistake "

@@ -11,7 +11,7 @@ off, which a port tilt takes up to the noise, lets 5 numbers of the placement sa
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,60 +59,70 @@ class Freed:
     are seen by all points, an outlier that was kept by a few."""
 
 
-def freed_lenses(calibration: CalibrationResult) -> Freed | None:
-    """Adjust a result once more with its lenses free.
+class FreedNumbers(NamedTuple):
+    """What each kind of held numbers changes, once it is free.
+
+    None: they were free already, the result is no optimum of the reprojection error
+    alone (another error, lengths from outside), or the images do not tell.
+    """
+
+    lenses: Freed | None = None
+    placement: Freed | None = None
+    """Of the cameras in the rig."""
+
+
+def freed_numbers(calibration: CalibrationResult) -> FreedNumbers:
+    """Adjust a result once more with its lenses free, and with its placement free.
 
     Args:
         calibration: The result.
-
-    Returns:
-        None: its lenses were free already, it is no optimum of the reprojection error
-        alone (another error, lengths from outside), or the images do not tell.
     """
+    options = calibration.options
+    kinds = _lenses(calibration), _placement(calibration)
+    alone = options.strategy == "joint" and options.error_name == "reprojection"
+    if not alone or calibration.entered is not None or not any(kinds):
+        return FreedNumbers()
+    scene, _ = calibration.scene.select(calibration.inliers)
+    how: dict[str, Any] = {f.name: getattr(options, f.name) for f in fields(options)}
+    how |= {"loss": "l2", "given": None}  # what is known of them must not hold them
+    if scene.num_observations > MAX_OBSERVATIONS:
+        try:
+            result = calibrate(_some_frames(scene), **how)
+        except UwsfmError:
+            return FreedNumbers()
+        scene, _ = result.scene.select(result.inliers)
+    return FreedNumbers(*(kind and _freed(scene, how, *kind) for kind in kinds))
+
+
+_Kind = tuple[dict[str, Any], int]
+"""Further options, and how many more numbers they let move."""
+
+
+def _lenses(calibration: CalibrationResult) -> _Kind | None:
     cameras = calibration.scene.cameras
     columns = calibration.covariance.border_cols
     if np.any(columns[:, border.FIRST_LENS :] != HELD):
         return None
     size = max(max(camera.width, camera.height) for camera in cameras)
     count = sum(len(param_slots(camera.camera.model_name)) for camera in cameras)
-    more = {**FREE_LENSES, "principal_point_stddev_px": CENTER_SHARE * size}
-    return _freed(calibration, more, count)
+    return {**FREE_LENSES, "principal_point_stddev_px": CENTER_SHARE * size}, count
 
 
-def freed_placement(calibration: CalibrationResult) -> Freed | None:
-    """Adjust a result once more with the placement of its cameras free.
-
-    Args:
-        calibration: The result.
-
-    Returns:
-        None: the placement was free already, or as of `freed_lenses`.
-    """
+def _placement(calibration: CalibrationResult) -> _Kind | None:
     others = len(calibration.scene.cameras) - 1
     if others == 0 or calibration.options.refine_cam_from_rig:
         return None
     # The length of the first baseline stays held: it is the scale.
-    count = 6 * others - 1
-    return _freed(calibration, {"refine_cam_from_rig": True}, count)
+    return {"refine_cam_from_rig": True}, 6 * others - 1
 
 
 def _freed(
-    calibration: CalibrationResult, more: dict[str, Any], count: int
+    scene: Scene, how: dict[str, Any], more: dict[str, Any], count: int
 ) -> Freed | None:
     """What further options change, which let so many more numbers move."""
     from scipy.stats import chi2  # heavy
 
-    options = calibration.options
-    alone = options.strategy == "joint" and options.error_name == "reprojection"
-    if not alone or calibration.entered is not None:
-        return None
-    scene, _ = calibration.scene.select(calibration.inliers)
-    how: dict[str, Any] = {f.name: getattr(options, f.name) for f in fields(options)}
-    how |= {"loss": "l2", "given": None}  # what is known of them must not hold them
     try:
-        if scene.num_observations > MAX_OBSERVATIONS:
-            result = calibrate(_some_frames(scene), **how)
-            scene, _ = result.scene.select(result.inliers)
         result = calibrate(scene, **{**how, **more})
     except UwsfmError:
         return None

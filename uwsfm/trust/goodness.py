@@ -19,7 +19,7 @@ from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.trust.bound import pull_below_zero
 from uwsfm.trust.central import fit_lens
-from uwsfm.trust.freed import Freed, freed_lenses, freed_placement
+from uwsfm.trust.freed import Freed, freed_numbers
 from uwsfm.trust.given import Departure, departures
 from uwsfm.trust.systematic import NOTHING, Systematic, systematic_part
 
@@ -120,6 +120,7 @@ def goodness_of(
     scene, _ = scene.select(known)
     left = _Left.of(scene)
     lengths, positions = calibration.lengths, calibration.positions
+    freed = freed_numbers(calibration)
     return Goodness(
         rms_px=float(np.sqrt(np.mean(np.sum(left.residuals**2, axis=1)))),
         sigma_px=calibration.summary.sigma_px,
@@ -133,8 +134,8 @@ def goodness_of(
         used=used,
         converged=calibration.summary.converged,
         departures=departures(rig, calibration),
-        freed_lenses=freed_lenses(calibration),
-        freed_placement=freed_placement(calibration),
+        freed_lenses=freed.lenses,
+        freed_placement=freed.placement,
         below_zero_z=pull_below_zero(calibration),
         known_length_z=None
         if lengths is None

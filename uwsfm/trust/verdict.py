@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from uwsfm._indices import distinct
 from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
@@ -204,8 +204,8 @@ def _systematic(goodness: Goodness) -> list[Reason]:
 def _lenses(goodness: Goodness) -> list[Reason]:
     """Cameras whose residuals a free lens would remove, or what is held of the rig."""
     together = _held_numbers(goodness)
-    if together and together[0].code == PLACEMENT:
-        return together  # which leaves in the images what a lens does, too
+    if together is not None and together.code == PLACEMENT:
+        return [together]  # which leaves in the images what a lens does, too
     reasons = []
     for camera in goodness.cameras:
         px, freed = camera.systematic_px, camera.freed_px
@@ -220,59 +220,64 @@ def _lenses(goodness: Goodness) -> list[Reason]:
         )
         numbers = {"px": px, "p_value": camera.p_value, "freed_px": freed}
         reasons.append(reason("lens_does_not_fit", text, severity, **numbers))
-    return reasons or together
+    if together is not None and not reasons:
+        return [together]
+    return reasons
 
 
-PLACEMENT = "placement_does_not_fit"
+class FreedWords(NamedTuple):
+    """What is said of numbers that the images would rather have free."""
+
+    name: str
+    alone: str
+    """After "it is not the", where something else is wrong as well."""
+    verdict: str
 
 
-def _held_numbers(goodness: Goodness) -> list[Reason]:
+LENSES, PLACEMENT = "lenses_do_not_fit", "placement_does_not_fit"
+FREED_WORDS = {
+    LENSES: FreedWords(
+        "lenses",
+        "lenses alone; check the placement of the cameras",
+        "the lenses, as given, do not fit, or something that a lens can stand for; "
+        "check their calibration.",
+    ),
+    PLACEMENT: FreedWords(
+        "placement of the cameras",
+        "placement alone; check the lenses",
+        "cam_from_rig, as held, does not fit, or something that it can stand for; "
+        "check it, or write refine_cam_from_rig: true.",
+    ),
+}
+
+
+def _held_numbers(goodness: Goodness) -> Reason | None:
     """All lenses together or the placement of the cameras, whichever as held costs
     more: each can stand for a part of the other."""
-    tried = {
-        "lenses_do_not_fit": (goodness.freed_lenses, "lenses"),
-        "placement_does_not_fit": (
-            goodness.freed_placement,
-            "placement of the cameras",
-        ),
-    }
+    tried = {LENSES: goodness.freed_lenses, PLACEMENT: goodness.freed_placement}
     found = []
-    for code, (freed, name) in tried.items():
+    for code, freed in tried.items():
         if freed is None or not _seen_by_all(freed):
             continue
         severity = _severity(freed.px, freed.p_value, goodness.sigma_px)
         if severity is not None:
-            text = _freed_text(freed, name, goodness.floor)
+            text = _freed_text(freed, FREED_WORDS[code], goodness.floor)
             numbers = {"px": freed.px, "p_value": freed.p_value, "gain": freed.gain}
             found.append(reason(code, text, severity, **numbers))
-    return sorted(found, key=lambda one: -one.numbers["px"])[:1]
+    return max(found, key=lambda one: one.numbers["px"], default=None)
 
 
-def _freed_text(freed: Freed, name: str, floor: NoiseFloor | None) -> str:
-    lenses = name == "lenses"
+def _freed_text(freed: Freed, words: FreedWords, floor: NoiseFloor | None) -> str:
     text = (
-        f"With the {name} free, {freed.px:.2g} px of the residuals vanish "
+        f"With the {words.name} free, {freed.px:.2g} px of the residuals vanish "
         f"({_chance(freed.p_value)}): "
     )
-    if floor is not None and freed.sigma_px >= ABOVE_FLOOR * floor.floor_px:
-        others = (
-            "lenses alone; check the placement of the cameras"
-            if lenses
-            else "placement alone; check the lenses"
-        )
-        return text + (
-            f"but a noise of {freed.sigma_px:.2g} px is left, where matches of pairs "
-            f"of images alone have {floor.floor_px:.2g} px, so it is not the {others} "
-            "and the ports as well."
-        )
-    if lenses:
-        return text + (
-            "the lenses, as given, do not fit, or something that a lens can stand for; "
-            "check their calibration."
-        )
+    if floor is None or freed.sigma_px < ABOVE_FLOOR * floor.floor_px:
+        return text + words.verdict
     return text + (
-        "cam_from_rig, as held, does not fit, or something that it can stand for; "
-        "check it, or write refine_cam_from_rig: true."
+        f"but a noise of {freed.sigma_px:.2g} px is left, where matches of pairs of "
+        f"images alone have {floor.floor_px:.2g} px, so it is not the {words.alone} "
+        "and the ports as well."
     )
 
 
