@@ -110,6 +110,8 @@ def placement(start: float) -> dict[str, Any]:
         "translation_m": [-0.101 * start, 0.0023 * start, 0.0045 * start],
         "rotation_stddev_deg": 0.0123 * start,
         "rotation_stddev_in_all_deg": 0.0234 * start,
+        "turn_xyz_stddev_deg": [0.0061 * start, 0.0072 * start, 0.0083 * start],
+        "turn_xyz_stddev_in_all_deg": [0.0114 * start, 0.0135 * start, 0.0146 * start],
         "translation_stddev_m": [1.1e-5, 2.2e-4, 3.3e-3],
         "translation_stddev_in_all_m": [4.4e-5, 5.5e-4, 6.6e-3],
     }

@@ -13,6 +13,7 @@ from uwsfm.cli_check import explanations_table
 from uwsfm.console import console
 from uwsfm.errors import InputError
 from uwsfm.export.files import RIG_GIVEN
+from uwsfm.job_log import LOG
 from uwsfm.trust.explanation import Explanation
 
 
@@ -38,6 +39,10 @@ def test_a_result_that_fits_has_no_explanation(out):
     assert found.returncode == 0, found.stderr
     assert "No mistake explains the images better" in found.stdout
     assert json.loads((out / CHECK).read_text())["explanations"] == []
+    lines = (out / LOG).read_text().splitlines()
+    (begin,) = [k for k, line in enumerate(lines) if f"uwsfm check {out}" in line]
+    log = "\n".join(lines[begin:])
+    assert "INFO looking for the cause" in log and "INFO verdict: fits" in log
 
 
 def test_a_folder_without_the_rig_as_given_is_refused(out):

@@ -14,6 +14,7 @@ from uwsfm.calibration.error_budget import TOGETHER, with_budget
 from uwsfm.calibration.given_errors import given_reach, in_all
 from uwsfm.calibration.given_items import given_items
 from uwsfm.export.summary import budget_summary, housing_summary, scale_summary
+from uwsfm.judgement import housing_warnings
 from uwsfm.report.tables import budget_lines, lengths_note
 from uwsfm.residuals import border
 from uwsfm.result_tables import budget_table
@@ -249,6 +250,17 @@ def test_a_stiff_prior_pulls_as_a_given_number(optimum):
     assert row.prior and not row.assumed
     expected = 1e-3 * held["water index"].shifts[0].distance_m
     assert row.shifts[0].distance_m == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_prior_is_told_beside_the_deviations_from_the_images(optimum):
+    """It is refined like an observation, and would pass for what the images show."""
+    rig = sample_rig()
+    for how, words in (({}, None), ({"focal_stddev": 2e-3}, "focal length of left")):
+        result = solved(optimum, refine_focal=bool(how), **how)
+        notes = housing_warnings(rig, result, error_budget(result))
+        told = [note for note in notes if "entered as a prior" in note]
+        assert len(told) == (words is not None)
+        assert all(words in note and "alike" not in note for note in told)
 
 
 def test_what_is_open_is_nan(optimum):

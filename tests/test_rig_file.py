@@ -297,6 +297,13 @@ def test_exchanged_indices_of_glass_and_water_are_named(tmp_path):
     assert _load(tmp_path, oil).cameras[0].port.n_water == 1.47
 
 
+def test_glass_that_bends_light_less_than_water_is_refused(tmp_path):
+    thin = _edited((PORT + "glass_index", 1.2))
+    _check_sentence(tmp_path, thin, "glass_index: 1.2 is less than the water's 1.3")
+    bare = _edited((PORT + "glass_index", 1.2), (PORT + "thickness_m", 0.0))
+    assert _load(tmp_path, bare).cameras[1].port.thickness == 0.0
+
+
 def test_the_first_of_several_problems_is_told_and_the_others_listed(tmp_path):
     edits = [(PORT + "distance_m", 20), (PORT + "type", 3), ("version", "one")]
     others = "must be 1, not 'one' (and 1 more problem in this file: cameras[1].port.ty"

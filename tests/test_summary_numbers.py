@@ -126,11 +126,13 @@ def test_the_placement_is_the_scenes_and_only_of_the_others(model, result):
             assert known == pytest.approx(expected)
         else:
             assert known == (None,) * 4
+            assert right["turn_xyz_stddev_deg"] == [None] * 3
         assert right["rotation_stddev_in_all_deg"] == pytest.approx(5.0 * 0.0163)
         total = right["translation_stddev_in_all_m"]
         assert total == pytest.approx([5 * 7.1e-5, 5 * 8.2e-5, 5 * 9.3e-5])
         # The first camera is the rig: nothing of it can err.
         assert left["rotation_stddev_deg"] is left["rotation_stddev_in_all_deg"] is None
+        assert left["turn_xyz_stddev_in_all_deg"] == [None] * 3
         assert left["translation_stddev_m"] == [None] * 3
         assert left["translation_stddev_in_all_m"] == [None] * 3
 

@@ -14,7 +14,8 @@ from hand_made_result import (
     with_ports,
 )
 
-from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg
+from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
+from uwsfm.geometry import rigid3
 from uwsfm.models.port import FlatPort
 from uwsfm.residuals import border
 
@@ -96,3 +97,42 @@ def test_a_held_tilt_has_no_deviation_and_a_wild_azimuth_half_a_turn(result):
     straight = with_ports(result.scene, (FlatPort(distance=0.02), PORTS[1]))
     found = paper_tilt(replace(result, scene=straight), 0)
     assert found.azimuth_stddev_deg == 180.0 and found.tilt_deg == 0.0
+
+
+def test_deviations_of_a_turn_are_those_of_many_draws(result, rng):
+    """A camera turned by 50 degrees, whose small turns have a covariance: the rotation
+    vector scatters otherwise than they do. Twice as much where neighbours share errors,
+    and more with what is given."""
+    turn = np.radians([20.0, -40.0, 25.0])
+    block = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, -0.5], [0.0, -0.5, 1.0]]) * 1e-8
+    count = 3 + len(result.covariance.border)
+    matrix = np.zeros((count, count))
+    matrix[3:, 3:], matrix[:3, :3] = result.covariance.border, block / 4.0
+    columns = np.where(result.covariance.border_cols < 0, -1, 3)
+    columns[:, border.ROTATION] = (-1, -1, -1), (0, 1, 2)
+    angle = math.degrees(math.sqrt(np.trace(block)))
+    cameras = camera_covariance(2.0), camera_covariance(4.0, rotation_stddev_deg=angle)
+    given = result.covariance.in_all.given.copy()
+    rows = border.BORDER_SIZE + np.r_[border.ROTATION]
+    given[np.ix_(rows, rows)] = np.diag([9.0, 1.0, 2.0]) * 1e-8
+    placement = result.scene.cam_from_rig.copy()
+    placement[1, :4] = rigid3.quat_from_rotvec(turn)
+    calibration = replace(
+        result,
+        scene=replace(result.scene, cam_from_rig=placement),
+        covariance=replace(
+            result.covariance,
+            border=matrix,
+            border_cols=columns,
+            cameras=cameras,
+            in_all=replace(result.covariance.in_all, given=given),
+        ),
+    )
+    own, in_all = turn_stddevs_deg(calibration, 1)
+    for found, total in (own, block), (in_all, block + given[np.ix_(rows, rows)]):
+        delta = np.zeros((20_000, 6))
+        delta[:, :3] = rng.multivariate_normal(np.zeros(3), total, 20_000)
+        turned = rigid3.perturb(placement[1], delta)
+        spread = np.std(rigid3.rotvec_from_quat(turned[:, :4]), axis=0)
+        np.testing.assert_allclose(found, np.degrees(spread), rtol=0.02)
+    assert turn_stddevs_deg(calibration, 0) == ([None] * 3, [None] * 3)

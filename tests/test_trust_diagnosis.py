@@ -30,6 +30,7 @@ from uwsfm.trust.diagnosis import (
 )
 from uwsfm.trust.mistakes import shifted, trials
 from uwsfm.trust.trials import adjusted
+from uwsfm.trust.verdict import FEW_OBSERVATIONS
 
 NUM_FRAMES = 8
 
@@ -341,4 +342,17 @@ def test_a_result_that_fits_is_not_searched():
     """The verdict decides: no trial is run, whatever they would find."""
     rig, scene = wrong_input(FAST[0])
     result = calibrate(scene, **rig_options(rig))
-    assert explain("fits", rig, result) == ()
+    assert explain("fits", (), rig, result) == ()
+
+
+def test_of_few_observations_less_is_claimed():
+    """What explains a fifth of the observations may not explain the rest."""
+    rig, scene = wrong_input(FAST[0])
+    result = calibrate(scene, **rig_options(rig))
+    (of_all, *_), (of_few, *_) = (
+        explain("does not fit", codes, rig, result)
+        for codes in (("floor",), ("floor", FEW_OBSERVATIONS))
+    )
+    assert of_all.code == of_few.code
+    assert of_all.text.startswith("Probably ") and of_few.text.startswith("Perhaps ")
+    assert of_few.text.endswith("left out, and may have another cause.")

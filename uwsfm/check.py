@@ -8,9 +8,11 @@ from typing import Any
 
 from uwsfm._progress import Progress, silent
 from uwsfm.export.summary import write_json
+from uwsfm.job_log import job_log
 from uwsfm.result_folder import given_rig, open_result
 from uwsfm.trust.diagnosis import diagnose, options_of
-from uwsfm.trust.explanation import Explanation
+from uwsfm.trust.explanation import Explanation, of_few_observations
+from uwsfm.trust.verdict import FEW_OBSERVATIONS
 
 CHECK = "check.json"
 
@@ -48,16 +50,20 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
     result = open_result(out)
     rig = given_rig(result.folder)
     model, summary = result.model, result.summary
-    found = Check(
-        verdict=summary.get("verdict"),
-        reasons=tuple(summary.get("reasons", ())),
-        explanations=diagnose(
+    with job_log(result.folder, f"uwsfm check {out}", {}, progress) as log:
+        causes = diagnose(
             rig,
             model.scene,
             model.frame_names,
-            progress,
+            log.progress,
             **options_of(result.calibration),
-        ),
-    )
-    write_json(found.to_json(), result.folder / CHECK)
+        )
+        reasons = tuple(summary.get("reasons", ()))
+        if FEW_OBSERVATIONS in {one["code"] for one in reasons}:
+            causes = tuple(map(of_few_observations, causes))
+        found = Check(
+            verdict=summary.get("verdict"), reasons=reasons, explanations=causes
+        )
+        write_json(found.to_json(), result.folder / CHECK)
+        log.result(found.to_json())
     return found

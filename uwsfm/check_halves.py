@@ -20,6 +20,7 @@ from uwsfm.export.summary import (
     write_json,
 )
 from uwsfm.export.verdict_summary import with_verdict
+from uwsfm.job_log import job_log
 from uwsfm.judgement import housing_warnings
 from uwsfm.report.files import write_report
 from uwsfm.report.gather import PAGE
@@ -56,14 +57,17 @@ def check_halves(out: str | Path, progress: Progress = silent) -> dict[str, Any]
             f"made this result; {RUN_AGAIN}"
         )
     given = given_rig(result.folder)
-    progress("adjusting halves", 0, None)
-    found = cross_validate(given, result.solved)
-    summary = cross_validated(result, given, found)
-    store_judgement(result, enlarged(result.solved, found.enlarged), summary["verdict"])
-    write_json(summary, result.folder / SUMMARY)
-    if (result.folder / PAGE).is_file():
-        progress("report", 0, None)
-        write_report(result.folder)
+    with job_log(result.folder, f"uwsfm check {out} --halves", {}, progress) as log:
+        log.progress("adjusting halves", 0, None)
+        found = cross_validate(given, result.solved)
+        summary = cross_validated(result, given, found)
+        larger = enlarged(result.solved, found.enlarged)
+        store_judgement(result, larger, summary["verdict"])
+        write_json(summary, result.folder / SUMMARY)
+        if (result.folder / PAGE).is_file():
+            log.progress("report", 0, None)
+            write_report(result.folder)
+        log.result(summary)
     numbers: dict[str, Any] = summary[KEY]
     return numbers
 

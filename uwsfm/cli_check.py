@@ -54,7 +54,7 @@ def check(
     from uwsfm.export.files import read_summary
 
     summary = read_summary(out) or {}
-    print_verdict({**summary, "explanations": ()})
+    print_verdict(_without_causes(summary))
     if found.explanations:
         console.print(explanations_table(found.explanations))
     else:
@@ -72,11 +72,16 @@ def _check_halves(out: Path) -> None:
 
         found = check_halves(out, progress)
     summary = read_summary(out) or {}
-    print_verdict({**summary, "explanations": ()})
+    print_verdict(_without_causes(summary))
     console.print(halves_table(found))
     for sentence in found["sentences"]:
         console.print(sentence, markup=False)
     finish(summary, f"written: {out / SUMMARY}")
+
+
+def _without_causes(summary: dict[str, Any]) -> dict[str, Any]:
+    """Those of the run: what this command finds stands in their place."""
+    return {key: value for key, value in summary.items() if key != "explanations"}
 
 
 def explanations_table(explanations: Iterable[Explanation]) -> Table:

@@ -59,6 +59,7 @@ class ProgressBars:
             raise interruption from None
 
 
+NO_CAUSE = "none of the mistakes that were tried explains the images better"
 STYLES = {"fits": "bold green", "doubtful": "bold yellow", "does not fit": "bold red"}
 
 
@@ -71,5 +72,8 @@ def print_verdict(summary: dict[str, Any]) -> None:
     for reason in summary.get("reasons", ()):
         line = Text(f"{reason['severity']}: {reason['text']}")
         console.print(Padding(line, (0, 0, 0, 2)))
-    for one in summary.get("explanations", ()):
+    causes = summary.get("explanations")
+    for one in causes or ():
         console.print(Padding(Text(f"cause: {one['text']}"), (0, 0, 0, 2)))
+    if causes is not None and not causes and summary["reasons"]:
+        console.print(Padding(Text(f"cause: {NO_CAUSE}"), (0, 0, 0, 2)))

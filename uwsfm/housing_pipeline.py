@@ -289,7 +289,13 @@ class _Job:
         }
         summary = judged.added_to(summary, rig)
         if self.start != "pairs":  # single pairs hold what most mistakes show in
-            causes = explain(judged.word, self.rig, calibration, progress=self.progress)
+            causes = explain(
+                judged.word,
+                judged.verdict.codes,
+                self.rig,
+                calibration,
+                progress=self.progress,
+            )
             summary["explanations"] = [one.to_json() for one in causes]
         export_housing(rig, self.out / HOUSING, calibration, verdict=judged.word)
         write_json(summary, self.out / HOUSING_SUMMARY)

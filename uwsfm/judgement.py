@@ -6,7 +6,7 @@ from typing import Any
 
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.enlarged import enlarged
-from uwsfm.calibration.error_budget import BudgetRow, with_budget
+from uwsfm.calibration.error_budget import ALIKE, BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.export.halves_summary import KEY, halves_numbers
@@ -96,6 +96,17 @@ def judged_result(
     )
 
 
+def _prior_note(budget: Sequence[BudgetRow]) -> list[str]:
+    """What a reader might take to be of the images alone."""
+    priors = [row.name for row in budget if row.prior and ALIKE not in row.name]
+    if not priors:
+        return []
+    return [
+        'standard deviations "from the images" hold what was entered as a prior, too: '
+        + ", ".join(priors)
+    ]
+
+
 def housing_warnings(
     rig: Rig,
     calibration: CalibrationResult,
@@ -111,6 +122,7 @@ def housing_warnings(
     if verdict != DOES_NOT_FIT:
         warnings += verdicts(calibration, names, budget)
     warnings += enlarged_notes(calibration.covariance.enlarged)
+    warnings += _prior_note(budget)
     bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
     if bare:
         warnings.append(

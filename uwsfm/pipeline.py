@@ -226,7 +226,12 @@ class _Job:
         summary = judged.added_to(summary, model.rig)
         clock = time.perf_counter()
         causes = explain(
-            judged.word, self.rig, calibration, model.frame_names, self.progress
+            judged.word,
+            judged.verdict.codes,
+            self.rig,
+            calibration,
+            model.frame_names,
+            self.progress,
         )
         summary["explanations"] = [one.to_json() for one in causes]
         timings["looking for the cause"] = time.perf_counter() - clock

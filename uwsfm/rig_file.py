@@ -132,12 +132,20 @@ GLASSY = 1.42
 
 
 def _check_order(port: Port) -> None:
-    """Refuse glass and water whose indices are exchanged."""
+    """Refuse glass and water whose indices are exchanged, or that no window has."""
     if not isinstance(port, NoPort) and port.n_glass < port.n_water > GLASSY:
         raise InputError(
             f"water.refractive_index: {port.n_water:g} is the index of a glass, and "
             f"glass_index {port.n_glass:g} that of a liquid: are they exchanged? Water "
             "has about 1.333, glass 1.5"
+        )
+    if isinstance(port, NoPort) or port.thickness == 0.0 or IMPLAUSIBLE_ALLOWED.get():
+        return
+    if port.n_glass < port.n_water:
+        raise InputError(
+            f"glass_index: {port.n_glass:g} is less than the water's "
+            f"{port.n_water:g}, and no window is made of such a material (acrylic has "
+            "1.49, glass 1.46 to 1.52); a port without glass has thickness_m: 0"
         )
 
 

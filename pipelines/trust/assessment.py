@@ -50,7 +50,9 @@ def assessed(
     reasons = [f"{reason.code}: {reason.text}" for reason in verdict.reasons]
     causes: tuple[str, ...] = ()
     if diagnosed:
-        found = explain(verdict.verdict, rig, refined.calibration, frame_names)
+        found = explain(
+            verdict.verdict, verdict.codes, rig, refined.calibration, frame_names
+        )
         causes = tuple(one.code for one in found)
         reasons += [one.text for one in found]
     return Assessment(verdict=verdict.verdict, words=" ".join(reasons), causes=causes)

@@ -190,6 +190,7 @@ class Study:
         """`uwsfm refine` of stock COLMAP's model; None if that lacks a frame."""
         folder = self._folder(case.frames)
         stock, best = folder / "stock", folder / "best"
+        shutil.rmtree(folder / "refined", ignore_errors=True)
         if not best.exists():
             model = stock_model(self.images(case.frames), stock, MAX_FEATURES)
             best.mkdir()

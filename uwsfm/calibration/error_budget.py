@@ -103,6 +103,10 @@ def with_budget(
     return calibration, error_budget(calibration, reach)
 
 
+ALIKE = ", all cameras alike"
+"""The end of a row's name."""
+
+
 class _Sheet:
     """Steps of the estimates, and what one standard deviation of each is in all."""
 
@@ -136,7 +140,7 @@ class _Sheet:
             if not shared:
                 yield from (self._row(f"{what} of {m.camera}", [m]) for m in members)
             if len(members) > 1:
-                alike = what if shared else f"{what}, all cameras alike"
+                alike = what if shared else what + ALIKE
                 yield self._row(alike, members)
 
     def _are_one(self, members: list[GivenItem]) -> bool:

@@ -1,5 +1,6 @@
-"""Port tilts as Sedlazeck & Koch print them: azimuth and tilt of the normal.
+"""Angles of ports and cameras, each with its own standard deviation.
 
+Port tilts are printed as Sedlazeck & Koch do: azimuth and tilt of the normal,
 n = (sin theta cos phi, sin theta sin phi, cos theta) in the camera frame.
 """
 
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.geometry import unit_vector
+from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.port import FlatPort
 from uwsfm.residuals import border
@@ -48,7 +49,7 @@ def paper_tilt(calibration: CalibrationResult, camera: int) -> PaperTilt:
     basis = unit_vector.tangent_basis(port.normal)
     angles = np.stack([around, outwards]) @ basis  # (2, 2) by the normal's tangents
     angles[0] /= max(sine, 1e-12)
-    own, in_all = _blocks(calibration, camera)
+    own, in_all = _normal_blocks(calibration, camera)
     images = [_degrees(a @ own @ a) for a in angles]
     total = [_degrees(a @ in_all @ a) for a in angles]
     return PaperTilt(
@@ -61,9 +62,11 @@ def paper_tilt(calibration: CalibrationResult, camera: int) -> PaperTilt:
     )
 
 
-def slope_stddevs_deg(
-    calibration: CalibrationResult, camera: int
-) -> tuple[list[float | None], list[float | None]]:
+_Stddevs = tuple[list[float | None], list[float | None]]
+"""From the images, and in all."""
+
+
+def slope_stddevs_deg(calibration: CalibrationResult, camera: int) -> _Stddevs:
     """Standard deviations of asin(n_x) and asin(n_y), degrees: from the images, and in
     all. Together they make the angle of `CameraCovariance.normal_stddev_deg`, of which
     each alone is about 1 / sqrt(2). None: held, or not determined.
@@ -76,26 +79,58 @@ def slope_stddevs_deg(
     assert isinstance(port, FlatPort)
     level = np.sqrt(1.0 - np.square(port.normal[:2]))
     slopes = unit_vector.tangent_basis(port.normal)[:2] / level[:, None]
+    return _stddevs(slopes, _normal_blocks(calibration, camera))
+
+
+def turn_stddevs_deg(calibration: CalibrationResult, camera: int) -> _Stddevs:
+    """Standard deviations of cam_from_rig's rotation vector, x, y, z, degrees: from the
+    images, and in all. Together they make the angle of
+    `CameraCovariance.rotation_stddev_deg`. None: held, or not determined.
+
+    Args:
+        calibration: with its covariance.
+        camera: index of a camera.
+    """
+    angle = calibration.covariance.cameras[camera].rotation_stddev_deg
+    blocks = _blocks(calibration, camera, border.ROTATION, angle)
+    turn = rigid3.rotvec_from_quat(calibration.scene.cam_from_rig[camera, :4])
+    return _stddevs(rigid3.rotvec_by_turn(turn), blocks)
+
+
+def _stddevs(jacobian: Array, blocks: tuple[Array, Array]) -> _Stddevs:
     own, in_all = (
-        [_degrees(slope @ block @ slope) for slope in slopes]
-        for block in _blocks(calibration, camera)
+        [_degrees(row @ block @ row) for row in jacobian] for block in blocks
     )
     return own, in_all
 
 
-def _blocks(calibration: CalibrationResult, camera: int) -> tuple[Array, Array]:
+def _normal_blocks(calibration: CalibrationResult, camera: int) -> tuple[Array, Array]:
     """(2, 2) of the normal's tangents, from the images and in all."""
+    angle = calibration.covariance.cameras[camera].normal_stddev_deg
+    return _blocks(calibration, camera, border.NORMAL, angle)
+
+
+def _blocks(
+    calibration: CalibrationResult, camera: int, slot: slice, angle_deg: float
+) -> tuple[Array, Array]:
+    """Covariances of an angle's tangents, from the images and in all.
+
+    Args:
+        calibration: with its covariance.
+        camera: index of a camera.
+        slot: of the tangents in the camera's row of the border.
+        angle_deg: their root sum of squares as it is printed, from the images: errors
+            that neighbours share make it larger than that of the border.
+    """
     covariance = calibration.covariance
-    columns = covariance.border_cols[camera, border.NORMAL]
-    own = np.zeros((2, 2))
+    columns = covariance.border_cols[camera, slot]
+    own = np.zeros((len(columns), len(columns)))
     if columns[0] != HELD:
         own = covariance.border[np.ix_(columns, columns)].copy()
-        # Errors that neighbours share make the angle's deviation larger than these.
-        angle = np.radians(covariance.cameras[camera].normal_stddev_deg)
-        own *= angle**2 / np.trace(own)
+        own *= np.radians(angle_deg) ** 2 / np.trace(own)
     total = own
     if covariance.in_all is not None:
-        rows = camera * border.BORDER_SIZE + np.r_[border.NORMAL]
+        rows = camera * border.BORDER_SIZE + np.r_[slot]
         total = own + covariance.in_all.given[np.ix_(rows, rows)]
     return own, total
 

@@ -23,7 +23,7 @@ from uwsfm.calibration.observability import (
 )
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.calibration.reopened import reopened
-from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg
+from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.models.lens import param_slots
 from uwsfm.models.port import DomePort, FlatPort, NoPort
@@ -56,6 +56,7 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
         pose = calibration.scene.cam_from_rig[index]
         turned = index > 0 and calibration.options.refine_cam_from_rig
         placed = index > 0
+        own, total = turn_stddevs_deg(calibration, index)
         entries.append(
             {
                 "name": camera.name,
@@ -66,12 +67,14 @@ def housing_summary(rig: Rig, calibration: CalibrationResult) -> list[dict]:
                     "rotation_xyzw": pose[:4].tolist(),
                     "translation_m": pose[4:].tolist(),
                     "rotation_stddev_deg": _stddev(cov.rotation_stddev_deg, turned),
+                    "turn_xyz_stddev_deg": own if turned else 3 * [None],
                     "translation_stddev_m": [
                         _stddev(value, turned) for value in cov.translation_stddev_m
                     ],
                     "rotation_stddev_in_all_deg": _stddev(
                         in_all.rotation_stddev_deg, placed
                     ),
+                    "turn_xyz_stddev_in_all_deg": total if placed else 3 * [None],
                     "translation_stddev_in_all_m": [
                         _stddev(value, placed) for value in in_all.translation_stddev_m
                     ],

@@ -137,6 +137,21 @@ def rotvec_from_quat(quat: ArrayLike) -> Array:
     return scale * quat[..., :3]
 
 
+def rotvec_by_turn(rotvec: ArrayLike) -> Array:
+    """(3, 3) derivative of a rotation vector (3,) by a small turn after the rotation:
+    the inverse left Jacobian of SO(3), regular below a whole turn."""
+    rotvec = np.asarray(rotvec, dtype=np.float64)
+    angle = float(np.linalg.norm(rotvec))
+    x, y, z = rotvec
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    half = 0.5 * angle
+    # (1 - half cot half) / angle^2, whose limit at zero is 1 / 12.
+    factor = 1.0 / 12.0
+    if angle > 1e-4:  # where the difference has lost no digits that matter
+        factor = (1.0 - half / np.tan(half)) / angle**2
+    return np.asarray(np.eye(3) - 0.5 * cross + factor * cross @ cross)
+
+
 def perturb(b_from_a: ArrayLike, delta: ArrayLike) -> Array:
     """Left perturbation of poses (..., 7) by tangents (..., 6) [rotation, translation].
 

@@ -114,11 +114,12 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
 
 def _placement(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     pose, group = camera["cam_from_rig"], camera["name"]
-    both = pose["rotation_stddev_deg"], pose["rotation_stddev_in_all_deg"]
     turn = np.degrees(rigid3.rotvec_from_quat(pose["rotation_xyzw"])).tolist()
+    none = 3 * [None]  # of an earlier version
+    known = (pose.get(f"turn_xyz_stddev{kind}_deg", none) for kind in ("", "_in_all"))
     rows = [
-        _number(group, f"cam_from_rig turn {axis}", value, both, ("deg", 1.0))
-        for axis, value in zip("xyz", turn, strict=True)
+        _number(group, f"cam_from_rig turn {axis}", value, (own, total), ("deg", 1.0))
+        for axis, value, own, total in zip("xyz", turn, *known, strict=True)
     ]
     place = pose["translation_m"], pose["translation_stddev_m"]
     small = small_lengths(summary)

@@ -286,4 +286,4 @@ def _check_counts(
 
 
 def _words(found: Mapping[str, str]) -> str:
-    return " or ".join(found.values())
+    return "; or ".join(found.values())

@@ -264,10 +264,11 @@ def image_corrections(rig: Rig) -> Iterator[Correction]:
 def shift_words(name: str, shift: int, since: str = "") -> tuple[str, str]:
     """What is wrong, and what to do, if a camera's images belong ``shift`` frames
     later than their names say."""
-    way = "early" if shift > 0 else "late"
+    way, side = ("early", "after") if shift > 0 else ("late", "before")
     count = f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''}"
     return (
-        f"the images of {name!r} are {count} {way}{since}",
+        f"the images of {name!r} are {count} {way}{since} (each belongs {count} {side} "
+        "the one of its name)",
         "pair the images anew, for images of equal names must be taken together",
     )
 

@@ -8,7 +8,7 @@ a placement that are near the rig file's, which the result with it has left.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from uwsfm.trust.explanation import (
     Explanation,
     Tried,
     explanations,
+    of_few_observations,
 )
 from uwsfm.trust.midway import (
     ZoomTrial,
@@ -38,7 +39,7 @@ from uwsfm.trust.midway import (
 )
 from uwsfm.trust.mistakes import Trial, length_trials, trials
 from uwsfm.trust.trials import Fit, fit_of, retriangulated_where_lost, thinned
-from uwsfm.trust.verdict import FITS
+from uwsfm.trust.verdict import FEW_OBSERVATIONS, FITS
 
 MAX_TILT_DEG = 15.0
 """Of a flat port; more is no usual housing."""
@@ -51,6 +52,7 @@ AT_ZERO = 2.0
 
 def explain(
     verdict: str,
+    reason_codes: Collection[str],
     rig: Rig,
     calibration: CalibrationResult,
     frame_names: Sequence[str] | None = None,
@@ -60,6 +62,7 @@ def explain(
 
     Args:
         verdict: See `uwsfm.trust.verdict`; that a result fits ends the matter.
+        reason_codes: Of that verdict.
         rig: As given.
         calibration: The result.
         frame_names: As of `diagnose`.
@@ -68,7 +71,10 @@ def explain(
     if verdict == FITS:
         return ()
     scene, _ = calibration.scene.select(calibration.inliers)
-    return diagnose(rig, scene, frame_names, progress, **options_of(calibration))
+    found = diagnose(rig, scene, frame_names, progress, **options_of(calibration))
+    if FEW_OBSERVATIONS in reason_codes:
+        found = tuple(map(of_few_observations, found))
+    return found
 
 
 def options_of(calibration: CalibrationResult) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,14 @@ class Explanation:
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
+
+
+def of_few_observations(found: Explanation) -> Explanation:
+    """An explanation of the few observations that the adjustment kept, in words that
+    claim no more: most of what the images show may have another cause."""
+    text = found.text.replace("Probably ", "Perhaps ", 1)
+    text += " Most observations were left out, and may have another cause."
+    return replace(found, text=text)
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,8 @@ order 50."""
 FEW_KEPT, FEWEST_KEPT = 0.3, 0.15
 """Share of the map's observations that agree. Tracks of two views with 15 % outliers,
 some of too small an angle, keep 0.4 to 0.6; usual maps 0.8 and more."""
+FEW_OBSERVATIONS = "few_observations"
+"""The reason's code."""
 FEW_FRAMES = 0.5
 """Share of frames that are registered."""
 KNOWN_LENGTH, SCATTERED, LEFT_OUT = 4.0, 3.0, 0.4
@@ -74,6 +76,11 @@ class Verdict:
     reasons: tuple[Reason, ...]
     """The severe ones first; empty: it fits."""
     goodness: Goodness
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Of the reasons."""
+        return tuple(one.code for one in self.reasons)
 
 
 def judge(
@@ -330,7 +337,7 @@ def _used(used: Used) -> list[Reason]:
                 "agree with the refractive model; the others were left out."
             )
             severity = DOES_NOT_FIT if share < FEWEST_KEPT else DOUBTFUL
-            reasons.append(reason("few_observations", text, severity, share=share))
+            reasons.append(reason(FEW_OBSERVATIONS, text, severity, share=share))
     return reasons
 
 
