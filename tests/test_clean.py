@@ -44,6 +44,7 @@ def test_each_filter_takes_out_its_points_and_counts_them(tmp_path: Path, rng):
     report = clean_cloud(tmp_path / "cloud.ply", tmp_path / "clean.ply")
     removed = {item["name"]: item["num_removed"] for item in report["filters"]}
     assert removed.pop("neighbours") == pytest.approx(NUM_BAD, abs=10)
+    removed.pop("connected with the main surface")
     assert removed == {
         "position is finite": NUM_BAD,
         "views": NUM_BAD,
@@ -81,3 +82,25 @@ def test_a_limit_on_what_a_cloud_lacks_is_refused(tmp_path: Path, rng):
     with pytest.raises(InputError, match=r"no point is left, 50 of 50.*'views'"):
         clean_cloud(tmp_path / "cloud.ply", tmp_path / "clean.ply", min_views=9)
     assert not (tmp_path / "clean.ply").exists()
+
+
+def test_strays_go_into_a_file_of_their_own(tmp_path: Path, rng):
+    """A clump beside the floor: good in every way, and not of its surface."""
+    cloud = floor_cloud(rng)
+    clump = np.arange(len(cloud)) < 60
+    cloud.points[clump] = 0.02 * rng.normal(size=(60, 3)) + [4.0, 0.0, -0.5]
+    write_cloud(cloud, tmp_path / "cloud.ply")
+    limits = {"outlier_ratio": np.inf, "min_views": np.inf}
+    report = clean_cloud(tmp_path / "cloud.ply", tmp_path / "clean.ply", **limits)
+    last = report["filters"][-1]
+    assert last["name"] == "connected with the main surface"
+    assert last["num_removed"] == 60 and report["num_kept"] == len(cloud) - 60
+    strays = read_cloud(tmp_path / "clean.strays.ply").points
+    np.testing.assert_allclose(strays, cloud.points[clump], atol=1e-6)
+    everything = clean_cloud(
+        tmp_path / "cloud.ply", tmp_path / "all.ply", parts="all", **limits
+    )
+    assert everything["num_kept"] == len(cloud)
+    assert not (tmp_path / "all.strays.ply").exists()
+    with pytest.raises(InputError, match="--parts some: is one of main, all"):
+        clean_cloud(tmp_path / "cloud.ply", tmp_path / "no.ply", parts="some")

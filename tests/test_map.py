@@ -20,7 +20,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.surface.commands import make_map
-from uwsfm.surface.height_map import make_height_map
+from uwsfm.surface.height_map import FILLED, MEASURED, NOTHING, make_height_map
 from uwsfm.surface.level import UPS, find_level, fit_plane, level_by_axis
 from uwsfm.surface.source import find_source
 
@@ -205,3 +205,41 @@ def test_points_of_a_result_are_cleaned_exported_and_mapped(tmp_path: Path):
     assert up[2] < -0.9
     with pytest.raises(InputError, match="map exists already"):
         make_map(out, tmp_path / "map")
+
+
+def test_gaps_are_filled_where_the_surface_is_smooth_and_marked():
+    """Points on a grid with two gaps four cells wide: across one the floor goes on,
+    across the other it rises by ten cells, as to something that stands before it."""
+    cell = 0.1
+    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
+    here = ~np.isin(np.floor(x), [10, 11, 12, 26, 27, 28])
+    z = 0.05 * x + np.where(x > 27.0, 10.0, 0.0)
+    points = cell * np.column_stack([x[here], y[here], z[here]])
+    colors = np.zeros((len(points), 3), np.uint8)
+    found = make_height_map(points, colors, resolution=cell, max_gap=6.0 * cell)
+    inner = found.origin[1:-1]
+    assert found.origin.shape == (20, 40)
+    assert (inner[:, :9] == MEASURED).all() and (inner[:, 14:25] == MEASURED).all()
+    assert (inner[:, 10:13] == FILLED).all() and (inner[:, 26:29] == NOTHING).all()
+    # Filled as the plane goes on, exactly; and no height where there is nothing.
+    middle = 0.05 * cell * (np.arange(10, 13) + 0.5)
+    np.testing.assert_allclose(found.height[5, 10:13], middle, atol=1e-6)
+    np.testing.assert_array_equal(np.isfinite(found.height), found.origin != NOTHING)
+    narrow = make_height_map(points, colors, resolution=cell, max_gap=3.0 * cell)
+    assert (narrow.origin[1:-1, 10:13] == NOTHING).all()
+
+
+def test_a_stray_far_away_does_not_widen_a_map(tmp_path: Path, rng):
+    cloud = floor_cloud(rng)
+    cloud.points[:3] += 1000.0
+    write_cloud(cloud, tmp_path / "cloud.ply")
+    report = make_map(tmp_path / "cloud.ply", tmp_path / "map")
+    assert report["num_strays"] == 3 and "3 points" in report["warnings"][-1]
+    assert report["share_with_data"] > 0.5
+    strays = read_cloud(tmp_path / "map" / "strays.ply").points
+    np.testing.assert_allclose(strays, cloud.points[:3], atol=1e-6)
+    origin = tifffile.imread(tmp_path / "map" / "origin.tif")
+    assert report["share_filled"] == pytest.approx(np.mean(origin == FILLED))
+    said = run("map", tmp_path / "cloud.ply", "-o", tmp_path / "all", "--parts", "all",
+               "--resolution", 1.0)  # fmt: skip
+    assert "strays" not in said

@@ -18,7 +18,11 @@ from uwsfm.export.files import (
 )
 from uwsfm.export.housing import export_housing
 from uwsfm.geometry import rigid3
-from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
+from uwsfm.surface.geotiff import (
+    write_color_tiff,
+    write_height_tiff,
+    write_origin_tiff,
+)
 from uwsfm.surface.height_map import HeightMap
 from uwsfm.surface.units import length_words, short_unit
 
@@ -166,11 +170,14 @@ def height_map():
         west=-7.5,
         north=11.0,
         max_gap=0.75,
+        origin=np.array([[1, 1, 0], [1, 2, 1]], dtype=np.uint8),
     )
 
 
 @pytest.mark.parametrize("unit", ["metre", "scale arbitrary"])
-@pytest.mark.parametrize("write", [write_height_tiff, write_color_tiff])
+@pytest.mark.parametrize(
+    "write", [write_height_tiff, write_color_tiff, write_origin_tiff]
+)
 def test_a_map_declares_its_scale_place_and_unit(height_map, tmp_path, unit, write):
     """Tags and keys by the GeoTIFF standard (OGC 19-008r4)."""
     tifffile = pytest.importorskip("tifffile")
@@ -196,6 +203,8 @@ def test_a_map_declares_its_scale_place_and_unit(height_map, tmp_path, unit, wri
     pixels = tifffile.imread(path)
     if write is write_height_tiff:
         np.testing.assert_array_equal(pixels, height_map.height)
+    elif write is write_origin_tiff:
+        np.testing.assert_array_equal(pixels, height_map.origin)
     else:
         assert pixels.shape == (2, 3, 4) and list(pixels[0, 1]) == [10, 20, 30, 255]
         assert tags[338] == (2,)  # alpha that colours were not multiplied by

@@ -23,6 +23,13 @@ UpOption = Annotated[
         show_default=False,
     ),
 ]
+PartsOption = Annotated[
+    Literal["main", "all"],
+    typer.Option(
+        help="main: the connected surface alone, and other parts with a tenth of its "
+        "points; strays go into a file of their own. all: every point."
+    ),
+]
 
 
 @interruptible()
@@ -64,6 +71,7 @@ def clean(
             show_default=False,
         ),
     ] = None,
+    parts: PartsOption = "main",
 ) -> None:
     """Leave out the bad points of a cloud, and count them. inf switches a limit off."""
     from uwsfm.surface.commands import clean_cloud
@@ -76,7 +84,7 @@ def clean(
         "outlier_ratio": outlier_ratio,
     }
     given = {name: value for name, value in limits.items() if value is not None}
-    report = clean_cloud(source, out, **given)
+    report = clean_cloud(source, out, parts, **given)
     _print_filters(report)
     typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
 
@@ -104,6 +112,7 @@ def mesh(
     web_triangles: Annotated[
         int, typer.Option(help="Of the decimated copy, at most.")
     ] = 100_000,
+    parts: PartsOption = "main",
 ) -> None:
     """Write a surface through the points: PLY, OBJ, GLB and a small GLB for the web."""
     from rich.markup import escape
@@ -119,6 +128,7 @@ def mesh(
         max_distance=max_distance,
         up=up,
         web_triangles=web_triangles,
+        parts=parts,
     )
     farthest = length_words(report["max_distance"], report["unit"])
     typer.echo(
@@ -149,11 +159,12 @@ def map_(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Distance between points that is bridged (default: five spacings); "
-            "what is wider stays a hole.",
+            help="Distance between points that is filled where the surface is smooth "
+            "(default: five spacings); what is wider stays a hole.",
             show_default=False,
         ),
     ] = None,
+    parts: PartsOption = "main",
 ) -> None:
     """Write a height map and an orthophoto as GeoTIFF, with a picture of both."""
     from rich.markup import escape
@@ -162,16 +173,18 @@ def map_(
     from uwsfm.surface.commands import make_map
     from uwsfm.surface.units import length_words
 
-    report = make_map(source, out, up=up, resolution=resolution, max_gap=max_gap)
+    report = make_map(
+        source, out, up=up, resolution=resolution, max_gap=max_gap, parts=parts
+    )
     cell = length_words(report["resolution"], report["unit"])
     typer.echo(
         f"{report['num_columns']} x {report['num_rows']} cells of "
-        f"{cell}, {report['share_with_data']:.0%} with "
-        f"data; {report['level']}"
+        f"{cell}, {report['share_with_data']:.0%} with data "
+        f"({report['share_filled']:.0%} filled between points); {report['level']}"
     )
     for warning in report["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
-    typer.echo(f"wrote {out}: height.tif, ortho.tif, map.json, map.png")
+    typer.echo(f"wrote {out}: height.tif, ortho.tif, origin.tif, map.json, map.png")
 
 
 def color(

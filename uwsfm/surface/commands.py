@@ -6,19 +6,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwsfm._files import checked_target, replaced_dir, replaced_file
 from uwsfm._packages import import_package
 from uwsfm._ply import write_ply
-from uwsfm.cloud import Cloud
+from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.result_folder import MAP, MESH
-from uwsfm.surface.clean import clean_points, default_options
-from uwsfm.surface.geotiff import write_color_tiff, write_height_tiff
-from uwsfm.surface.height_map import make_height_map
+from uwsfm.surface.clean import Filter, clean_points, default_options
+from uwsfm.surface.connected import main_parts
+from uwsfm.surface.geotiff import (
+    write_color_tiff,
+    write_height_tiff,
+    write_origin_tiff,
+)
+from uwsfm.surface.height_map import FILLED, make_height_map
 from uwsfm.surface.las import write_las
 from uwsfm.surface.level import world_from_map
 from uwsfm.surface.mesh import decimated, distances_to_cloud, make_mesh
@@ -27,18 +33,24 @@ from uwsfm.surface.preview import write_preview
 from uwsfm.surface.source import find_source
 from uwsfm.surface.units import length_words
 
+STRAYS = "strays.ply"
+"""Points that are not connected with the main surface."""
+MAIN, ALL = PARTS = ("main", "all")
+
 
 def clean_cloud(
-    source: str | Path, path: str | Path, **limits: float
+    source: str | Path, path: str | Path, parts: str = MAIN, **limits: float
 ) -> dict[str, Any]:
     """Write the good points of a cloud, all their columns kept; of the points of an
     adjustment also their ranges, which only the model beside them tells.
 
-    A JSON file of the same name holds what each filter removed.
+    A JSON file of the same name holds what each filter removed, and NAME.strays.ply
+    good points that are not connected with the main surface, if there are any.
 
     Args:
         source: result folder, or a PLY of its.
         path: the PLY to write; must not exist.
+        parts: one of `PARTS`: the main connected surface (`surface.connected`), or all.
         limits: fields of `uwsfm.surface.clean.CleanOptions`, by default those of
             `default_options`; infinity leaves a filter out.
 
@@ -53,6 +65,7 @@ def clean_cloud(
     if target.suffix != ".ply":
         raise InputError(f"{target}: the name of a cleaned cloud must end in .ply")
     report_path = checked_target(target.with_suffix(".json"))
+    strays_path = checked_target(target.with_suffix(f".{STRAYS}"))
     found = find_source(source)
     table = found.table()
     wanted: dict[str, Any] = {
@@ -66,6 +79,7 @@ def clean_cloud(
             f"{found.path}: no point is left, {worst.num_removed} of {len(table)} "
             f"failed at '{worst.name}'"
         )
+    strays = _leave_out_strays(table, keep, filters, parts)
     report = {
         "source": str(found.path),
         "model": found.model,
@@ -78,7 +92,58 @@ def clean_cloud(
     with replaced_file(report_path) as told, replaced_file(target) as partial:
         write_ply(partial, [("vertex", table[keep])], comment=comment)
         write_json(report, told)
+        if np.any(strays):
+            with replaced_file(strays_path) as beside:
+                write_ply(beside, [("vertex", table[strays])], comment=comment)
     return report
+
+
+def _leave_out_strays(
+    table: np.ndarray, keep: NDArray[np.bool_], filters: list[Filter], parts: str
+) -> NDArray[np.bool_]:
+    """Take out of ``keep`` what is not connected with the main surface; its mask."""
+    strays = np.zeros(len(table), dtype=bool)
+    if _checked_parts(parts) == ALL:
+        return strays
+    rows = np.flatnonzero(keep)
+    xyz = np.stack([table[axis][rows] for axis in "xyz"], axis=1).astype(np.float64)
+    found = main_parts(xyz)
+    strays[rows[~found.main]] = True
+    keep[strays] = False
+    filters.append(
+        Filter(
+            name="connected with the main surface",
+            limit=found.link,
+            num_tested=len(rows),
+            num_removed=int(np.count_nonzero(strays)),
+            num_unknown=0,
+        )
+    )
+    return strays
+
+
+def _checked_parts(parts: str) -> str:
+    if parts not in PARTS:
+        raise InputError(f"--parts {parts}: is one of {', '.join(PARTS)}")
+    return parts
+
+
+def _divided(cloud: Cloud, parts: str) -> tuple[Cloud, Cloud]:
+    """What a surface is made of, and the strays that it is made without."""
+    cloud = cloud.select(np.isfinite(cloud.points).all(axis=1))
+    everything = np.ones(len(cloud), dtype=bool)
+    main = everything if _checked_parts(parts) == ALL else main_parts(cloud.points).main
+    return cloud.select(main), cloud.select(~main)
+
+
+def _stray_warnings(strays: Cloud, cloud: Cloud) -> list[str]:
+    if not len(strays):
+        return []
+    share = len(strays) / (len(strays) + len(cloud))
+    return [
+        f"{len(strays)} points ({share:.2g} of all) are not connected with the main "
+        f"surface and were left out: {STRAYS} holds them, --parts all keeps them"
+    ]
 
 
 def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
@@ -110,8 +175,10 @@ def mesh_cloud(
     max_distance: float | None = None,
     up: str | None = None,
     web_triangles: int = 100_000,
+    parts: str = MAIN,
 ) -> dict[str, Any]:
-    """Write a mesh: mesh.ply, mesh.obj, mesh.glb, web.glb (decimated) and mesh.json.
+    """Write a mesh: mesh.ply, mesh.obj, mesh.glb, web.glb (decimated) and mesh.json;
+    and strays.ply with the points that are not connected with the main surface.
 
     Args:
         source: result folder, or a PLY of its.
@@ -120,6 +187,7 @@ def mesh_cloud(
         max_distance: of the surface from the points; default: four of their spacings.
         up: what is up in the world, for glTF; see `make_map`.
         web_triangles: of the decimated copy, at most.
+        parts: as of `clean_cloud`.
 
     Returns:
         What mesh.json holds.
@@ -133,7 +201,7 @@ def mesh_cloud(
     if web_triangles < 1:
         raise InputError(f"--web-triangles must be positive, got {web_triangles}")
     found = find_source(source)
-    cloud = found.cloud()
+    cloud, strays = _divided(found.cloud(), parts)
     level = found.level(cloud, up)
     mesh, reach = make_mesh(cloud, method, max_distance, found.above(cloud))
     small = decimated(mesh, web_triangles, cloud)
@@ -143,10 +211,11 @@ def mesh_cloud(
         "unit": found.unit,
         "method": method,
         "num_points": len(cloud),
+        "num_strays": len(strays),
         "max_distance": reach,
         "gltf": "metres, +y up" if found.unit == "metre" else "no metres, +y up",
         "level": level.method,
-        "warnings": found.warnings(),
+        "warnings": [*found.warnings(), *_stray_warnings(strays, cloud)],
     }
     for name, part in (("mesh", mesh), ("web", small)):
         report[name] = {
@@ -160,6 +229,8 @@ def mesh_cloud(
         write_obj(mesh, partial / "mesh.obj", found.unit)
         write_glb(mesh, partial / "mesh.glb", level, found.unit)
         write_glb(small, partial / "web.glb", level, found.unit)
+        if len(strays):
+            write_cloud(strays, partial / STRAYS, found.unit)
         write_json(report, partial / MESH)
     return report
 
@@ -171,8 +242,10 @@ def make_map(
     up: str | None = None,
     resolution: float | None = None,
     max_gap: float | None = None,
+    parts: str = MAIN,
 ) -> dict[str, Any]:
-    """Write a height map and an orthophoto: height.tif, ortho.tif, map.json, map.png.
+    """Write a height map and an orthophoto: height.tif, ortho.tif, origin.tif (what is
+    measured, and what filled between points), map.json, map.png; and strays.ply.
 
     Args:
         source: result folder, or a PLY of its (of a mesh, its vertices count).
@@ -181,6 +254,7 @@ def make_map(
             plane through the points is level, unless the world is that of positions.
         resolution: side of a cell, metres; default: the spacing of the points.
         max_gap: longest distance between points to bridge; default: five spacings.
+        parts: as of `clean_cloud`; strays would widen the map.
 
     Returns:
         What map.json holds, lengths in its "unit". Heights have no standard deviation
@@ -194,7 +268,7 @@ def make_map(
     target = checked_target(folder)
     import_package("tifffile", "uwsfm map", "inspect")
     found = find_source(source)
-    cloud = found.cloud()
+    cloud, strays = _divided(found.cloud(), parts)
     level = found.level(cloud, up)
     points = rigid3.transform(level.map_from_world, cloud.points)
     grid = make_height_map(points, cloud.colors, resolution, max_gap, found.unit)
@@ -213,11 +287,13 @@ def make_map(
         "num_rows": grid.height.shape[0],
         "num_columns": grid.height.shape[1],
         "share_with_data": float(np.mean(np.isfinite(grid.height))),
+        "share_filled": float(np.mean(grid.origin == FILLED)),
+        "num_strays": len(strays),
         "world_from_map": {
             "rotation_xyzw": pose[:4].tolist(),
             "translation": pose[4:].tolist(),
         },
-        "warnings": found.warnings(),
+        "warnings": [*found.warnings(), *_stray_warnings(strays, cloud)],
     }
     frame = f"uwsfm local frame, {level.method}"
     cell, gap = (length_words(x, found.unit) for x in (grid.resolution, grid.max_gap))
@@ -225,6 +301,9 @@ def make_map(
     with replaced_dir(target) as partial:
         write_height_tiff(grid, partial / "height.tif", frame, found.unit)
         write_color_tiff(grid, partial / "ortho.tif", frame, found.unit)
+        write_origin_tiff(grid, partial / "origin.tif", frame, found.unit)
+        if len(strays):
+            write_cloud(strays, partial / STRAYS, found.unit)
         write_preview(grid, partial / "map.png", title, found.unit)
         write_json(report, partial / MAP)
     return report

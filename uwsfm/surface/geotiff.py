@@ -37,6 +37,12 @@ def write_color_tiff(found: HeightMap, path: Path, frame: str, unit: str) -> Non
     _write(found, found.colors, path, frame, unit, kind)
 
 
+def write_origin_tiff(found: HeightMap, path: Path, frame: str, unit: str) -> None:
+    """Write what each cell holds: 0 nothing, 1 measured, 2 filled between points; the
+    rest as in `write_height_tiff`."""
+    _write(found, found.origin, path, frame, unit, {"photometric": "minisblack"})
+
+
 def _write(
     found: HeightMap,
     pixels: np.ndarray,

@@ -17,7 +17,14 @@ _NUM_SAMPLED = 20_000
 # points at random (1.09 / sqrt(density)).
 _NEIGHBOUR = 4
 _GAP_SPACINGS = 5.0
+_NEAR_SPACINGS = 2.5
+"""Points no farther apart are neighbours, and between them the surface is measured."""
+_SMOOTH_SLOPE = 1.0
+"""Of a gap between points that is filled: what is steeper may be the edge of something
+that stands in front of something else."""
 MAX_CELLS = 100_000_000
+NOTHING, MEASURED, FILLED = 0, 1, 2
+"""What a cell of a map holds."""
 _BLOCK = 500_000  # cells looked up at a time
 
 
@@ -29,6 +36,8 @@ class HeightMap:
     """(rows, columns) metres above the map's zero, NaN where there is no data."""
     colors: NDArray[np.uint8]
     """(rows, columns, 4) red, green, blue and 255; 0 where there is no data."""
+    origin: NDArray[np.uint8]
+    """(rows, columns) `NOTHING`, `MEASURED`, or `FILLED`: in a gap between points."""
     resolution: float
     """Side of a cell, metres."""
     west: float
@@ -72,7 +81,7 @@ def make_height_map(
     The points of a cell are joined at their middle (of those near their median height);
     these are joined by triangles, in which the centres of the cells are interpolated:
     exact on planes, however the points lie in the cells. Triangles with a side longer
-    than ``max_gap`` are holes.
+    than ``max_gap`` are holes, and so are gaps across which the surface rises steeply.
 
     Args:
         points: (N, 3), z up.
@@ -108,10 +117,13 @@ def make_height_map(
     row = np.clip(np.floor((north - points[:, 1]) / cell), 0, rows - 1)
     index = (row * columns + column).astype(np.int64)
     nodes = _joined(np.hstack([points, colors]), index, cell)
-    height, rgba = _between(nodes, (rows, columns), cell, west, north, gap)
+    nodes[:, :2] = (nodes[:, :2] - [west, north]) / cell
+    near = _NEAR_SPACINGS * max(spacing / cell, 1.0)
+    height, rgba, origin = _between(nodes, (rows, columns), cell, (near, gap / cell))
     return HeightMap(
         height=height,
         colors=rgba,
+        origin=origin,
         resolution=cell,
         west=west,
         north=north,
@@ -148,19 +160,22 @@ def _joined(values: Array, index: NDArray[np.int64], reach: float) -> Array:
 
 
 def _between(
-    nodes: Array,
-    shape: tuple[int, int],
-    cell: float,
-    west: float,
-    north: float,
-    max_gap: float,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Heights and RGBA at the centres of the cells, interpolated in triangles."""
+    nodes: Array, shape: tuple[int, int], cell: float, reach: tuple[float, float]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Heights, RGBA and origins at the centres of the cells, interpolated in triangles.
+
+    Args:
+        nodes: (n, 6) x, y in cells from the corner (Qhull's tolerances are absolute),
+            height, red, green, blue.
+        shape: rows and columns.
+        cell: side of a cell.
+        reach: sides of triangles that are measured, and that are filled at most, cells.
+    """
     rows, columns = shape
     height = np.full(rows * columns, np.nan, dtype=np.float32)
     rgba = np.zeros((rows * columns, 4), dtype=np.uint8)
-    # In cells, from the corner: Qhull's tolerances are absolute.
-    xy = (nodes[:, :2] - [west, north]) / cell
+    origin = np.zeros(rows * columns, dtype=np.uint8)
+    xy = nodes[:, :2]
     try:
         triangles = Delaunay(xy)
     except (QhullError, ValueError):
@@ -168,14 +183,12 @@ def _between(
     # One LAPACK call per triangle: threads would only wait for each other.
     with _THREADS.limit(limits=1, user_api="blas"):
         triangles.transform  # noqa: B018
-    corners = xy[triangles.simplices]  # (t, 3, 2)
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    bridged = sides.max(axis=1) * cell <= max_gap
+    kinds = _origins(nodes[triangles.simplices][..., :3] / [1.0, 1.0, cell], reach)
     for begin in range(0, rows * columns, _BLOCK):
         index = np.arange(begin, min(begin + _BLOCK, rows * columns))
         center = np.stack([index % columns + 0.5, -(index // columns) - 0.5], axis=1)
         found = triangles.find_simplex(center)
-        inside = (found >= 0) & bridged[found]
+        inside = (found >= 0) & (kinds[found] != NOTHING)
         found, index, center = found[inside], index[inside], center[inside]
         frame = triangles.transform[found]
         first = np.einsum("nij,nj->ni", frame[:, :2], center - frame[:, 2])
@@ -184,4 +197,18 @@ def _between(
         height[index] = values[:, 0]
         rgba[index, :3] = np.rint(np.clip(values[:, 1:], 0.0, 255.0))
         rgba[index, 3] = 255
-    return height.reshape(shape), rgba.reshape(*shape, 4)
+        origin[index] = kinds[found]
+    return height.reshape(shape), rgba.reshape(*shape, 4), origin.reshape(shape)
+
+
+def _origins(corners: Array, reach: tuple[float, float]) -> NDArray[np.uint8]:
+    """What triangles (t,) with corners (t, 3, 3), in cells, hold: see `_between`."""
+    near, most = reach
+    sides = corners - np.roll(corners, 1, axis=1)
+    longest = np.linalg.norm(sides[..., :2], axis=2).max(axis=1)
+    rise = np.abs(sides[..., 2]).max(axis=1)
+    smooth = rise <= _SMOOTH_SLOPE * longest
+    kinds = np.full(len(corners), NOTHING, dtype=np.uint8)
+    kinds[(longest <= most) & smooth] = FILLED
+    kinds[longest <= min(near, most)] = MEASURED
+    return kinds
