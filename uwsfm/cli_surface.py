@@ -89,7 +89,6 @@ def clean(
     typer.echo(f"wrote {out}, counts in {out.with_suffix('.json')}")
 
 
-@interruptible()
 def mesh(
     source: SourceArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
@@ -103,33 +102,58 @@ def mesh(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Of the surface from the points (default: four of their spacings); "
-            "what is further is a hole.",
+            help="Largest distance of the surface from the points (default: four of "
+            "their spacings); what is further is a hole.",
             show_default=False,
         ),
     ] = None,
     up: UpOption = None,
     web_triangles: Annotated[
-        int, typer.Option(help="Of the decimated copy, at most.")
+        int, typer.Option(help="Largest number of triangles of the decimated copy.")
     ] = 100_000,
     parts: PartsOption = "main",
+    texture: Annotated[
+        bool,
+        typer.Option(
+            "--texture",
+            help="Also write textured.glb: the decimated copy with the photographs on "
+            "it, exposures balanced.",
+        ),
+    ] = False,
+    texture_side: Annotated[
+        int, typer.Option(help="Largest side of the texture, in texels.")
+    ] = 4096,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the photographs, if they are no longer where they were.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a surface through the points: PLY, OBJ, GLB and a small GLB for the web."""
     from rich.markup import escape
 
-    from uwsfm.console import console
-    from uwsfm.surface.commands import mesh_cloud
+    from uwsfm.console import ProgressBars, console
+
+    with ProgressBars(NOTHING_WRITTEN) as progress:
+        from uwsfm.surface.commands import mesh_cloud
+
+        report = mesh_cloud(
+            source,
+            out,
+            progress,
+            method=method,
+            max_distance=max_distance,
+            up=up,
+            web_triangles=web_triangles,
+            parts=parts,
+            texture=texture,
+            texture_side=texture_side,
+            images=images,
+        )
     from uwsfm.surface.units import length_words
 
-    report = mesh_cloud(
-        source,
-        out,
-        method=method,
-        max_distance=max_distance,
-        up=up,
-        web_triangles=web_triangles,
-        parts=parts,
-    )
     farthest = length_words(report["max_distance"], report["unit"])
     typer.echo(
         f"{report['mesh']['num_triangles']} triangles "
@@ -137,9 +161,17 @@ def mesh(
         f"{farthest} from a point; glTF: {report['gltf']}, "
         f"{report['level']}"
     )
+    written = "mesh.ply, mesh.obj, mesh.glb, web.glb, mesh.json"
+    if texture:
+        told = report["texture"]
+        typer.echo(
+            f"texture: {told['width']} x {told['height']} from {told['num_images']} "
+            f"images, which see {told['share_seen']:.0%} of the surface"
+        )
+        written += ", textured.glb"
     for warning in report["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")
-    typer.echo(f"wrote {out}: mesh.ply, mesh.obj, mesh.glb, web.glb, mesh.json")
+    typer.echo(f"wrote {out}: {written}")
 
 
 @interruptible()

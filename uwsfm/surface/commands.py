@@ -1,7 +1,7 @@
 """What `uwsfm clean`, `mesh` and `map` do."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from uwsfm._files import checked_target, replaced_dir, replaced_file
 from uwsfm._packages import import_package
 from uwsfm._ply import write_ply
+from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.export.summary import write_json
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import MAP, MESH
+from uwsfm.result_folder import MAP, MESH, Result, open_result
+from uwsfm.surface.atlas import make_atlas
 from uwsfm.surface.clean import Filter, clean_points, default_options
 from uwsfm.surface.connected import main_parts
 from uwsfm.surface.geotiff import (
@@ -28,9 +30,15 @@ from uwsfm.surface.height_map import FILLED, make_height_map
 from uwsfm.surface.las import write_las
 from uwsfm.surface.level import world_from_map
 from uwsfm.surface.mesh import decimated, distances_to_cloud, make_mesh
-from uwsfm.surface.mesh_files import write_glb, write_mesh_ply, write_obj
+from uwsfm.surface.mesh_files import (
+    write_glb,
+    write_mesh_ply,
+    write_obj,
+    write_textured_glb,
+)
 from uwsfm.surface.preview import write_preview
-from uwsfm.surface.source import find_source
+from uwsfm.surface.source import Source, find_source
+from uwsfm.surface.texture import make_texture, texel_size
 from uwsfm.surface.units import length_words
 
 STRAYS = "strays.ply"
@@ -167,49 +175,78 @@ def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
     return cloud
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """How a mesh is made.
+
+    Raises:
+        InputError: a value that is none.
+    """
+
+    method: str = "poisson"
+    """One of `uwsfm.surface.mesh.METHODS`."""
+    max_distance: float | None = None
+    """Of the surface from the points; None: four of their spacings."""
+    up: str | None = None
+    """What is up in the world, for glTF; see `make_map`."""
+    web_triangles: int = 100_000
+    """Of the decimated copy, at most."""
+    parts: str = MAIN
+    """As of `clean_cloud`."""
+    texture: bool = False
+    """Also put the photographs on the decimated copy."""
+    texture_side: int = 4096
+    """Of the picture, texels at most; it is smaller where the photographs show less."""
+    images: str | Path | None = None
+    """Folder of the photographs; None: where they were."""
+
+    def __post_init__(self) -> None:
+        _checked_parts(self.parts)
+        if self.web_triangles < 1:
+            raise InputError(
+                f"--web-triangles must be positive, got {self.web_triangles}"
+            )
+        if not 64 <= self.texture_side <= 16384:
+            raise InputError(
+                f"--texture-side must be from 64 to 16384, got {self.texture_side}"
+            )
+
+
 def mesh_cloud(
-    source: str | Path,
-    folder: str | Path,
-    *,
-    method: str = "poisson",
-    max_distance: float | None = None,
-    up: str | None = None,
-    web_triangles: int = 100_000,
-    parts: str = MAIN,
+    source: str | Path, folder: str | Path, progress: Progress = silent, **options: Any
 ) -> dict[str, Any]:
     """Write a mesh: mesh.ply, mesh.obj, mesh.glb, web.glb (decimated) and mesh.json;
-    and strays.ply with the points that are not connected with the main surface.
+    strays.ply with the points that are not connected with the main surface; and
+    textured.glb, the decimated mesh with the photographs on it, if it is wanted.
 
     Args:
         source: result folder, or a PLY of its.
         folder: to write; must not exist.
-        method: one of `uwsfm.surface.mesh.METHODS`.
-        max_distance: of the surface from the points; default: four of their spacings.
-        up: what is up in the world, for glTF; see `make_map`.
-        web_triangles: of the decimated copy, at most.
-        parts: as of `clean_cloud`.
+        progress: called with the steps of the texture.
+        options: fields of `MeshOptions`.
 
     Returns:
         What mesh.json holds.
 
     Raises:
-        InputError: nothing to read, something to write over, or up is not known.
+        InputError: nothing to read, something to write over, up is not known, or
+            images for the texture are missing.
         UwsfmError: there is no surface near the points.
-        MissingPackageError: Open3D is missing.
+        MissingPackageError: Open3D or xatlas is missing.
     """
-    target = checked_target(folder)
-    if web_triangles < 1:
-        raise InputError(f"--web-triangles must be positive, got {web_triangles}")
+    target, asked = checked_target(folder), MeshOptions(**options)
     found = find_source(source)
-    cloud, strays = _divided(found.cloud(), parts)
-    level = found.level(cloud, up)
-    mesh, reach = make_mesh(cloud, method, max_distance, found.above(cloud))
-    small = decimated(mesh, web_triangles, cloud)
+    result = _with_images(found, asked) if asked.texture else None
+    cloud, strays = _divided(found.cloud(), asked.parts)
+    level = found.level(cloud, asked.up)
+    above = found.above(cloud)
+    mesh, reach = make_mesh(cloud, asked.method, asked.max_distance, above)
+    small = decimated(mesh, asked.web_triangles, cloud)
     report: dict[str, Any] = {
         "source": str(found.path),
         "model": found.model,
         "unit": found.unit,
-        "method": method,
+        "method": asked.method,
         "num_points": len(cloud),
         "num_strays": len(strays),
         "max_distance": reach,
@@ -229,10 +266,38 @@ def mesh_cloud(
         write_obj(mesh, partial / "mesh.obj", found.unit)
         write_glb(mesh, partial / "mesh.glb", level, found.unit)
         write_glb(small, partial / "web.glb", level, found.unit)
+        if result is not None:
+            atlas = make_atlas(small, texel_size(result.model), asked.texture_side)
+            images = result.require_images()
+            painted = make_texture(atlas, small, result.model, images, progress)
+            path = partial / "textured.glb"
+            write_textured_glb(atlas, painted.image, path, level, found.unit)
+            report["texture"] = {
+                "width": atlas.size[0],
+                "height": atlas.size[1],
+                "num_images": painted.num_images,
+                "share_seen": painted.share_seen,
+            }
         if len(strays):
             write_cloud(strays, partial / STRAYS, found.unit)
         write_json(report, partial / MESH)
     return report
+
+
+def _with_images(found: Source, asked: MeshOptions) -> Result:
+    """The result folder around a cloud; its photographs must be there.
+
+    Raises:
+        InputError: the cloud is not in one, or they are missing.
+    """
+    if found.folder is None:
+        raise InputError(
+            f"{found.path} is in no result folder, and only its model tells what the "
+            "photographs show: give the folder, or leave --texture out"
+        )
+    result = open_result(found.folder, asked.images)
+    result.require_images()
+    return result
 
 
 def make_map(

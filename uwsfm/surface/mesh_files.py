@@ -5,7 +5,9 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from uwsfm._files import replaced_file
@@ -13,6 +15,7 @@ from uwsfm._ply import write_ply
 from uwsfm.color.encoding import light_of
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.surface.atlas import Atlas
 from uwsfm.surface.level import Level
 from uwsfm.surface.mesh import Mesh
 
@@ -20,6 +23,8 @@ from uwsfm.surface.mesh import Mesh
 _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_Block = tuple[NDArray[Any], int, str, int]
+"""Values, and their component, type and target in glTF."""
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
@@ -63,15 +68,46 @@ def write_glb(mesh: Mesh, path: Path, level: Level, unit: str) -> None:
     precision), and turned by the node; ``asset.extras`` holds ``world_from_gltf``, the
     pose that leads from the turned positions back to the world, and the unit.
     """
-    middle = np.round(mesh.vertices.mean(axis=0), 3)
-    positions = (mesh.vertices - middle).astype("<f4")
     # The standard has vertex colours linear: they are multiplied, not shown.
-    light = np.ones((len(positions), 4))
+    light = np.ones((len(mesh.vertices), 4))
     light[:, :3] = light_of(mesh.colors, "srgb")
-    blocks = [
-        (positions, _FLOAT, "VEC3", _ARRAY_BUFFER),
+    block = np.rint(65535.0 * light).astype("<u2"), _USHORT, "VEC4", _ARRAY_BUFFER
+    _write_binary(*_document(mesh, level, unit, "COLOR_0", block), path)
+
+
+def write_textured_glb(
+    atlas: Atlas, image: NDArray[np.uint8], path: Path, level: Level, unit: str
+) -> None:
+    """As `write_glb`, with a picture in place of colours.
+
+    Args:
+        atlas: of the mesh.
+        image: (height, width, 3) red, green, blue; stored as JPEG.
+        path: the file.
+        level: what is up.
+        unit: of lengths.
+    """
+    block = atlas.uv.astype("<f4"), _FLOAT, "VEC2", _ARRAY_BUFFER
+    document, blocks = _document(atlas.mesh, level, unit, "TEXCOORD_0", block)
+    ok, jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    assert ok
+    document["images"] = [{"bufferView": len(blocks), "mimeType": "image/jpeg"}]
+    document["textures"] = [{"source": 0}]
+    material = document["materials"][0]["pbrMetallicRoughness"]
+    material["baseColorTexture"] = {"index": 0}
+    _write_binary(document, blocks, path, jpeg.tobytes())
+
+
+def _document(
+    mesh: Mesh, level: Level, unit: str, color: str, block: _Block
+) -> tuple[dict[str, Any], list[_Block]]:
+    """A glTF document of a mesh, and its arrays; ``block`` holds the attribute
+    ``color`` of the vertices."""
+    middle = np.round(mesh.vertices.mean(axis=0), 3)
+    blocks: list[_Block] = [
+        ((mesh.vertices - middle).astype("<f4"), _FLOAT, "VEC3", _ARRAY_BUFFER),
         (mesh.normals.astype("<f4"), _FLOAT, "VEC3", _ARRAY_BUFFER),
-        (np.rint(65535.0 * light).astype("<u2"), _USHORT, "VEC4", _ARRAY_BUFFER),
+        block,
         (mesh.triangles.astype("<u4").reshape(-1, 1), _UINT, "SCALAR", _ELEMENT_BUFFER),
     ]
     quat = gltf_pose(level)
@@ -99,7 +135,7 @@ def write_glb(mesh: Mesh, path: Path, level: Level, unit: str) -> None:
             {
                 "primitives": [
                     {
-                        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
+                        "attributes": {"POSITION": 0, "NORMAL": 1, color: 2},
                         "indices": 3,
                         "material": 0,
                     }
@@ -114,11 +150,13 @@ def write_glb(mesh: Mesh, path: Path, level: Level, unit: str) -> None:
             }
         ],
     }
-    _write_binary(document, blocks, path)
+    return document, blocks
 
 
-def _write_binary(document: dict[str, Any], blocks: list, path: Path) -> None:
-    """A glTF document and its arrays, in one file."""
+def _write_binary(
+    document: dict[str, Any], blocks: list[_Block], path: Path, picture: bytes = b""
+) -> None:
+    """A glTF document, its arrays and a picture behind them, in one file."""
     offset, data = 0, []
     document["bufferViews"], document["accessors"] = [], []
     for index, (values, component, kind, target) in enumerate(blocks):
@@ -145,6 +183,11 @@ def _write_binary(document: dict[str, Any], blocks: list, path: Path) -> None:
         padding = -values.nbytes % 4
         data.append(values.tobytes() + bytes(padding))
         offset += values.nbytes + padding
+    if picture:
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(picture)}
+        document["bufferViews"].append(view)
+        data.append(picture + bytes(-len(picture) % 4))
+        offset += len(data[-1])
     document["buffers"] = [{"byteLength": offset}]
     text = json.dumps(document, allow_nan=False).encode("utf-8")
     text += b" " * (-len(text) % 4)
