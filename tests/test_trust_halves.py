@@ -412,3 +412,13 @@ def test_lengths_of_a_scale_that_is_hardly_known_are_compared_by_their_shape():
     gaps, covariance = _differences([first, 1.7 * first], [noise, noise], 1.7)
     np.testing.assert_allclose(gaps, 0.7 * first)
     np.testing.assert_allclose(covariance, 2.0 * noise)
+
+
+def test_a_half_whose_scale_is_loose_may_have_shrunk(rng):
+    """A third of its own lengths is a twelfth of the other half's: loose all the same."""
+    first = rng.uniform(0.3, 2.0, 40)
+    second = 0.22 * first * (1.0 + 1e-3 * rng.standard_normal(40))
+    known = np.diag((1e-3 * first) ** 2)
+    loose = 0.22**2 * (known + np.outer(first, first) * 0.35**2)
+    gaps, covariance = _differences([first, second], [known, loose], 0.22)
+    assert np.mean(gaps**2 / np.diag(covariance)) < 2.0  # 0.5 to be expected

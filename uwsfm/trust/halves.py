@@ -367,8 +367,12 @@ def _differences(
         scale: of the second half over the first.
     """
     gaps, covariance = lengths[1] - lengths[0], covariances[0] + covariances[1]
-    relative = np.sqrt(np.diag(covariance)) / lengths[0]
-    if np.median(relative) < LOOSE_SCALE:
+    # Each to its own lengths: a half whose scale is loose may have shrunk to a fifth.
+    relative = [
+        np.diag(each) / length**2
+        for each, length in zip(covariances, lengths, strict=True)
+    ]
+    if np.sqrt(np.median(np.sum(relative, axis=0))) < LOOSE_SCALE:
         return gaps, covariance
     gaps = lengths[1] / scale - lengths[0]
     covariance = covariances[0] + covariances[1] / scale**2
