@@ -12,7 +12,7 @@ from uwsfm.models.port import Port
 # Published calibrations: COLMAP's documentation (the first three), EuRoC cam0 (RADIAL
 # without its tangential terms; OPENCV, barrel), URIL's StereoPi (OPENCV, pincushion),
 # KITTI cam0 (FULL_OPENCV, five terms), the depth camera of an Azure Kinect (all eight),
-# TUM-VI cam0 (OPENCV_FISHEYE).
+# TUM-VI cam0 (OPENCV_FISHEYE). The last five are of the size that such lenses have.
 _CALIBRATIONS = """
 SIMPLE_PINHOLE 3072 2304 2559.81 1536 1152
 PINHOLE 3072 2304 2560.56 2560.56 1536 1152
@@ -23,6 +23,11 @@ OPENCV 640 480 501.08 499.89 322.91 249.04 0.1624 -0.2485 -7.29e-4 3.5e-3
 FULL_OPENCV 1392 512 984.24 980.81 690 233.2 -0.373 0.204 2.2e-3 1.4e-3 -0.0723 0 0 0
 FULL_OPENCV 1024 1024 504.8 505 510.6 504.8 3.87 2.07 1.6e-4 7e-5 0.086 4.2 3.33 0.509
 OPENCV_FISHEYE 512 512 190.978 190.973 254.932 256.897 3.48e-3 7.15e-4 -2.05e-3 2.03e-4
+SIMPLE_RADIAL_FISHEYE 800 600 400 400 300 0.01
+RADIAL_FISHEYE 800 600 400 401 300 0.01 -0.002
+THIN_PRISM_FISHEYE 800 600 400 401 399 305 .01 .001 1e-3 2e-3 -2e-4 1e-5 1e-3 -2e-3
+FOV 640 480 256 255 319 239 0.92
+EUCM 800 600 380 381 400 300 0.58 1.1
 """
 
 

@@ -12,6 +12,7 @@ from jacobians import (
 
 from uwsfm import FlatPort, InputError, RefractiveCamera, Status
 from uwsfm.models.lens import (
+    ANGLE_KINDS,
     SUPPORTED_MODELS,
     dir_from_img,
     distort,
@@ -27,20 +28,18 @@ NO_PORT = FlatPort(distance=0.0, thickness=0.0, n_glass=1.0, n_water=1.0)
 EVERY_OTHER_MODEL = [
     "SIMPLE_FISHEYE 800 600 400 400 300",
     "FISHEYE 800 600 400 401 400 300",
-    "SIMPLE_RADIAL_FISHEYE 800 600 400 400 300 0.01",
-    "RADIAL_FISHEYE 800 600 400 400 300 0.01 -0.002",
-    "FOV 800 600 400 401 400 300 0.9",
-    "THIN_PRISM_FISHEYE 800 600 400 401 400 300 .01 .001 1e-4 2e-4 0 0 1e-4 1e-4",
     "RAD_TAN_THIN_PRISM_FISHEYE 800 600 400 401 400 300 .01 0 0 0 0 0 0 0 0 0 0 0",
     "SIMPLE_DIVISION 800 600 400 400 300 -0.05",
     "DIVISION 800 600 400 401 400 300 -0.05",
-    "EUCM 800 600 400 401 400 300 0.6 1.1",
 ]
+
+
+FISHEYES = ("OPENCV_FISHEYE", "FOV")
 
 
 def pixel_grid(camera, count=15):
     """The whole image; of a fisheye, whose corners are behind it, up to 76 degrees."""
-    low, high = (0.15, 0.85) if camera.model_name == "OPENCV_FISHEYE" else (0.0, 1.0)
+    low, high = (0.15, 0.85) if camera.model_name in FISHEYES else (0.0, 1.0)
     share = np.linspace(low, high, count)
     grid = np.meshgrid(camera.width * share, camera.height * share)
     return np.stack(grid, axis=-1).reshape(-1, 2)
@@ -65,8 +64,10 @@ def test_pixels_are_those_of_colmap(camera, rng):
     assert np.isfinite(dirs).all()
     dirs = np.concatenate([dirs, 0.99 * dirs, [[0.0, 0.0, 2.0]]])
     expected = camera.img_from_cam(dirs)
-    # Both are closed forms: a few roundings of some 3000 px.
-    np.testing.assert_allclose(img_from_dirs(dirs, lens), expected, atol=5e-12, rtol=0)
+    # Both are closed forms: a few roundings of some 3000 px. COLMAP's FOV is a series
+    # of two terms within a hundredth of the focal length (measured: 1.4e-10).
+    atol = 1e-9 if camera.model_name == "FOV" else 5e-12
+    np.testing.assert_allclose(img_from_dirs(dirs, lens), expected, atol=atol, rtol=0)
 
 
 @EXAMPLES
@@ -100,7 +101,11 @@ def test_lens_jacobian(camera):
 
 def _random_dirs(lens, rng, count=400):
     """Directions all over the part of a lens that it claims to invert."""
-    reach = np.tan(min(lens[13], 1.5)) if lens[12] == 2.0 else np.sqrt(min(lens[13], 9))
+    reach = (
+        np.tan(min(lens[13], 1.5))
+        if lens[12] in ANGLE_KINDS
+        else np.sqrt(min(lens[13], 9))
+    )
     radius = reach * np.sqrt(rng.uniform(0.0, 1.0, count))
     radius[:50] = reach * (1.0 - 10.0 ** rng.uniform(-4.0, -1.0, 50))
     angle = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -205,6 +210,10 @@ def test_every_other_model_unprojects_and_is_refused_for_projection(rng):
         ("SIMPLE_PINHOLE", [0.0, 320, 240]),
         ("OPENCV", [500, -500, 320, 240, 0, 0, 0, 0]),
         ("FISHBOWL", [1.0]),
+        ("FOV", [300, 300, 320, 240, 0.0]),
+        ("FOV", [300, 300, 320, 240, 3.2]),
+        ("EUCM", [300, 300, 320, 240, -0.1, 1.0]),
+        ("EUCM", [300, 300, 320, 240, 0.5, 0.0]),
     ],
 )
 def test_unusable_parameters_are_refused_with_the_model_named(model, params):

@@ -415,7 +415,7 @@ def test_lengths_of_a_scale_that_is_hardly_known_are_compared_by_their_shape():
 
 
 def test_a_half_whose_scale_is_loose_may_have_shrunk(rng):
-    """A third of its own lengths is a twelfth of the other half's: loose all the same."""
+    """A third of its own lengths is a twelfth of the other half's, and loose."""
     first = rng.uniform(0.3, 2.0, 40)
     second = 0.22 * first * (1.0 + 1e-3 * rng.standard_normal(40))
     known = np.diag((1e-3 * first) ** 2)

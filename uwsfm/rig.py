@@ -245,7 +245,7 @@ def camera_from_colmap(
     """
     import pycolmap
 
-    from uwsfm.models.lens import SUPPORTED_MODELS
+    from uwsfm.models.lens import SUPPORTED_MODELS, lens_row
 
     if model not in lens_models():
         raise InputError(
@@ -274,6 +274,8 @@ def camera_from_colmap(
                 f"{names[k]} = {params[k]:g} puts the principal point outside the "
                 f"image of {width} x {height}"
             )
+    if model in SUPPORTED_MODELS:
+        lens_row(model, params)  # distortion that no such lens has is refused
     camera.has_prior_focal_length = True
     return camera
 

@@ -19,6 +19,15 @@ from uwsfm.calibration.named_covariance import (
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens import (
+    ANGLE_KINDS,
+    BROWN,
+    KIND,
+    NUM_PARAMS,
+    PINHOLE,
+    dir_from_img,
+    jac_by_params,
+)
 from uwsfm.residuals import border
 
 FOCAL = 1e-3
@@ -62,10 +71,14 @@ _BROWN = ({4: 2, 5: 4, 8: 6}, {9: 2, 10: 4, 11: 6})
 """Lens slots of radial coefficients with the power of the radius: above and below the
 fraction line."""
 _FISHEYE = ({4: 2, 5: 4, 8: 6, 9: 8},)
+_SHAPE = ({4: 0}, {5: 0})
+"""Of lenses whose numbers are no powers: they err each by itself."""
 
 
 def _radial(camera: "GivenCamera") -> tuple[dict[int, int], ...]:
-    return _FISHEYE if camera.lens[12] == 2 else _BROWN
+    if camera.lens[KIND] in ANGLE_KINDS:
+        return _FISHEYE
+    return _BROWN if camera.lens[KIND] in (PINHOLE, BROWN) else _SHAPE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,9 +270,22 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
 def _corner_shift(camera: GivenCamera, slot: int) -> float:
     """How far one unit of a coefficient moves the image corner, as a share of its
     distance from the centre."""
+    if _radial(camera) is _SHAPE:
+        return _shape_shift(camera.lens, camera.size_px, slot)
     powers = {slot: power for chain in _radial(camera) for slot, power in chain.items()}
     corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[0])
     return corner ** powers.get(slot, 2)
+
+
+def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
+    """The same of a lens whose numbers are no coefficients, by its derivative."""
+    corner = float(np.hypot(*size_px)) / 2.0
+    x, _, z = dir_from_img(lens[2] + corner, lens[3], lens)
+    if not z > 0.0:  # as far as it sees
+        x, _, z = dir_from_img(lens[2] + 0.5 * min(size_px), lens[3], lens)
+    jac = np.empty((2, NUM_PARAMS))
+    jac_by_params(x / z, 0.0, lens, jac)
+    return float(abs(jac[0, slot])) / corner
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,45 +1,67 @@
 """In-air lenses: from a viewing direction to a pixel and back, with the Jacobian.
 
-Seven COLMAP camera models are two kernels: every Brown model is FULL_OPENCV with zeros,
-and OPENCV_FISHEYE stands alone. A lens is one row of LENS_SIZE numbers
+Every Brown model of COLMAP is FULL_OPENCV with zeros, and every fisheye OPENCV_FISHEYE;
+the other kinds are in `uwsfm.models.lens_wide`. A lens is one row of LENS_SIZE numbers
 
     [fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, kind, limit]
 
-where ``kind`` is 0 (no distortion), 1 (Brown) or 2 (fisheye) and ``limit`` is the
-largest squared radius (Brown) or angle (fisheye) up to which the radial distortion
-grows: beyond it a second, false ray would share the pixel. Pixels follow COLMAP: the
-centre of the first pixel is (0.5, 0.5).
+where ``kind`` is one of `KINDS` and ``limit`` is the largest squared radius (of a
+fisheye: angle) up to which the radial distortion grows: beyond it a second, false ray
+would share the pixel. Pixels follow COLMAP: the first one's centre is (0.5, 0.5).
 """
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from uwsfm._jit import inner, lane
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_wide import (
+    EUCM,
+    FOV,
+    THIN_PRISM,
+    dir_from_wide,
+    distort_wide,
+    wide_by_params,
+    wide_limit,
+)
 
 LENS_SIZE = 14
 NUM_PARAMS = 12
-PINHOLE, BROWN, FISHEYE = 0, 1, 2
+PINHOLE: Final = 0
+BROWN: Final = 1
+FISHEYE: Final = 2
+KIND, LIMIT = 12, 13
+"""Places in the row."""
+_ALL = tuple(range(NUM_PARAMS))
 
-# Where each COLMAP model keeps its parameters in the common row.
-_SLOTS: dict[str, tuple[int, ...]] = {
-    "SIMPLE_PINHOLE": (0, 2, 3),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 2, 3, 4),
-    "RADIAL": (0, 2, 3, 4, 5),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
-    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
-    "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 8, 9),
+# The kind of each COLMAP model, and where it keeps its parameters in the common row.
+_MODELS: dict[str, tuple[int, tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": (BROWN, (0, 2, 3)),
+    "PINHOLE": (BROWN, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL": (BROWN, (0, 2, 3, 4)),
+    "RADIAL": (BROWN, (0, 2, 3, 4, 5)),
+    "OPENCV": (BROWN, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "FULL_OPENCV": (BROWN, _ALL),
+    "SIMPLE_RADIAL_FISHEYE": (FISHEYE, (0, 2, 3, 4)),
+    "RADIAL_FISHEYE": (FISHEYE, (0, 2, 3, 4, 5)),
+    "OPENCV_FISHEYE": (FISHEYE, (0, 1, 2, 3, 4, 5, 8, 9)),
+    "THIN_PRISM_FISHEYE": (THIN_PRISM, _ALL),
+    "FOV": (FOV, (0, 1, 2, 3, 4)),
+    "EUCM": (EUCM, (0, 1, 2, 3, 4, 5)),
 }
-SUPPORTED_MODELS = tuple(_SLOTS)
+SUPPORTED_MODELS = tuple(_MODELS)
+KINDS = (PINHOLE, BROWN, FISHEYE, FOV, EUCM, THIN_PRISM)
+ANGLE_KINDS = (FISHEYE, THIN_PRISM)
+"""Their radial coefficients are of the angle, and so is their ``limit``."""
 
 
 def param_slots(model: str) -> tuple[int, ...]:
     """Where the parameters of a COLMAP model are in its lens row; fx may be fy too."""
-    return _SLOTS[model]
+    return _MODELS[model][1]
 
 
 def lens_row(model: str, params: Sequence[float] | Array) -> Array:
@@ -48,12 +70,12 @@ def lens_row(model: str, params: Sequence[float] | Array) -> Array:
     Raises:
         InputError: the model has no kernel here, or the parameters do not fit it.
     """
-    if model not in _SLOTS:
+    if model not in _MODELS:
         raise InputError(
             f"camera model {model} has no projection here; "
             f"use one of {', '.join(SUPPORTED_MODELS)}"
         )
-    slots = _SLOTS[model]
+    kind, slots = _MODELS[model]
     values = np.asarray(params, dtype=np.float64)
     if values.shape != (len(slots),) or not np.all(np.isfinite(values)):
         raise InputError(
@@ -66,18 +88,28 @@ def lens_row(model: str, params: Sequence[float] | Array) -> Array:
         row[1] = row[0]
     if row[0] <= 0.0 or row[1] <= 0.0:
         raise InputError(f"camera model {model}: the focal length must be positive")
-    row[12] = FISHEYE if model == "OPENCV_FISHEYE" else BROWN
-    return with_limit(row)
+    row[KIND] = kind
+    row = with_limit(row)
+    if not row[LIMIT] > 0.0:
+        raise InputError(
+            f"camera model {model}: {values[4:].tolist()} are no parameters of such a "
+            "lens (FOV: 0 < omega < pi; EUCM: alpha >= 0, beta > 0)"
+        )
+    return row
 
 
 def with_limit(row: Array) -> Array:
     """A lens row with ``kind`` and ``limit`` as its parameters demand."""
     row = row.copy()
-    if row[12] == FISHEYE:
-        row[13] = _fisheye_limit(row)
+    if row[KIND] not in KINDS:
+        raise InputError(f"{row[KIND]:g} is no kind of lens")
+    if row[KIND] in ANGLE_KINDS:
+        row[LIMIT] = _fisheye_limit(row)
+    elif row[KIND] in (FOV, EUCM):
+        row[LIMIT] = wide_limit(row)
     else:
-        row[12] = BROWN if np.any(row[4:NUM_PARAMS] != 0.0) else PINHOLE
-        row[13] = _brown_limit(row)
+        row[KIND] = BROWN if np.any(row[4:NUM_PARAMS] != 0.0) else PINHOLE
+        row[LIMIT] = _brown_limit(row)
     return row
 
 
@@ -113,11 +145,13 @@ def _fisheye_limit(row: Array) -> float:
 @inner
 def distort(u, v, lens):
     """Distorted (u, v), and d(distorted) / d(u, v) as 4 scalars; NaN out of range."""
-    if lens[12] == 0.0:
+    if lens[12] == PINHOLE:
         return u, v, 1.0, 0.0, 0.0, 1.0
-    if lens[12] == 1.0:
+    if lens[12] == BROWN:
         return _distort_brown(u, v, lens)
-    return _distort_fisheye(u, v, lens)
+    if lens[12] == FISHEYE:
+        return _distort_fisheye(u, v, lens)
+    return distort_wide(u, v, lens)
 
 
 @lane
@@ -211,8 +245,11 @@ def jac_by_params(u, v, lens, jac):
     fx, fy = lens[0], lens[1]
     jac[0, 0], jac[1, 0], jac[0, 1], jac[1, 1] = ud, 0.0, 0.0, vd
     jac[0, 2], jac[1, 2], jac[0, 3], jac[1, 3] = 1.0, 0.0, 0.0, 1.0
+    if lens[12] > FISHEYE:
+        wide_by_params(u, v, lens, jac)
+        return
     s = u * u + v * v
-    if lens[12] == 2.0:
+    if lens[12] == FISHEYE:
         radius = math.sqrt(s)
         theta = math.atan(radius)
         power = 1.0 if radius < 1e-8 else theta / radius
@@ -267,10 +304,12 @@ def dir_from_img(px, py, lens):
     nan = math.nan
     xd = (px - lens[2]) / lens[0]
     yd = (py - lens[3]) / lens[1]
-    if lens[12] == 2.0:
+    if lens[12] == FISHEYE:
         return _dir_from_fisheye(xd, yd, lens)
+    if lens[12] > FISHEYE:
+        return dir_from_wide(xd, yd, lens)
     u, v = xd, yd
-    if lens[12] == 1.0:
+    if lens[12] == BROWN:
         u, v = _undistort_brown(xd, yd, lens)
     norm = math.sqrt(1.0 + u * u + v * v)
     if not norm < math.inf:

@@ -16,7 +16,14 @@ from uwsfm.models.lanes import (
     VY,
     VZ,
 )
-from uwsfm.models.lens import brown, coefficients, fisheye_angle
+from uwsfm.models.lens import (
+    BROWN,
+    FISHEYE,
+    PINHOLE,
+    brown,
+    coefficients,
+    fisheye_angle,
+)
 
 # Newton is quadratic: a step of 1e-8 was the last but rounding.
 LAST_STEP2: Final = 1e-16
@@ -69,19 +76,26 @@ def _store(lens_fx, lens_fy, lens_cx, lens_cy, i, u, v, inv_z, distorted, ok, bu
     buffer[OK * STRIDE + i] *= 1.0 if ok > 0.0 else 0.0
 
 
+@lane
+def _none(buffer):
+    """No lane is OK."""
+    for i in range(BLOCK):
+        buffer[OK * STRIDE + i] = 0.0
+
+
 @inner
 def img_lanes(lens, buffer):
     """Pixels and d(pixel) / dv of the rays in air VX, VY, VZ."""
     fx, fy, cx, cy, limit = lens[0], lens[1], lens[2], lens[3], lens[13]
     params = coefficients(lens)
-    if lens[12] == 0.0:
+    if lens[12] == PINHOLE:
         for i in range(BLOCK):
             z = buffer[VZ * STRIDE + i]
             inv_z = 1.0 / z
             u, v = buffer[VX * STRIDE + i] * inv_z, buffer[VY * STRIDE + i] * inv_z
             plain = (u, v, 1.0, 0.0, 1.0)
             _store(fx, fy, cx, cy, i, u, v, inv_z, plain, z, buffer)
-    elif lens[12] == 1.0:
+    elif lens[12] == BROWN:
         for i in range(BLOCK):
             z = buffer[VZ * STRIDE + i]
             inv_z = 1.0 / z
@@ -89,6 +103,8 @@ def img_lanes(lens, buffer):
             x, y, xu, xv, yv, det = brown(u, v, params)
             ok = min(z, min(det, limit - (u * u + v * v)))
             _store(fx, fy, cx, cy, i, u, v, inv_z, (x, y, xu, xv, yv), ok, buffer)
+    elif lens[12] != FISHEYE:  # left to the scalar kernels
+        _none(buffer)
     else:
         for i in range(BLOCK):
             z = buffer[VZ * STRIDE + i]
@@ -138,7 +154,7 @@ def dir_lanes(lens, buffer):
         buffer[VX * STRIDE + i] = (buffer[PX * STRIDE + i] - cx) * inv_fx
         buffer[VY * STRIDE + i] = (buffer[PY * STRIDE + i] - cy) * inv_fy
         buffer[OK * STRIDE + i] = 1.0
-    if lens[12] == 2.0:
+    if lens[12] == FISHEYE:
         for i in range(BLOCK):
             xd, yd = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
             target = math.sqrt(xd * xd + yd * yd)
@@ -155,7 +171,9 @@ def dir_lanes(lens, buffer):
             buffer[VZ * STRIDE + i] = cosine
             buffer[OK * STRIDE + i] = 1.0 if ok > 0.0 else 0.0
         return
-    if lens[12] == 1.0:
+    if lens[12] > FISHEYE:
+        _none(buffer)
+    if lens[12] == BROWN:
         for i in range(BLOCK):
             xd, yd = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
             u, v, _ = _undistort_step(xd, yd, xd, yd, params)

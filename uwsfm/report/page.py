@@ -164,9 +164,9 @@ def _view_caption(report: Report) -> str:
 
 
 def _pinhole_models(report: Report) -> str:
-    larger = {"FULL_OPENCV", "OPENCV_FISHEYE"}
-    models = {c.model for c in report.residuals if c.pinhole is not None} & larger
-    return "COLMAP's OPENCV" + "".join(f" or {model}" for model in sorted(models))
+    models = {c.model for c in report.residuals if c.pinhole is not None}
+    others = sorted(models - {"OPENCV"})
+    return "COLMAP's OPENCV" + "".join(f" or {model}" for model in others)
 
 
 def _residual_words(camera: CameraResiduals) -> str:

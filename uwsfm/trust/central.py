@@ -13,7 +13,18 @@ from uwsfm.models.refractive import RefractiveCamera
 
 _LEAST_MODEL = "OPENCV"
 """Two focal lengths, principal point, two radial and two tangential coefficients."""
-_LARGER_MODELS = frozenset({"FULL_OPENCV", "OPENCV_FISHEYE"})
+_LARGER_MODELS = {
+    "FULL_OPENCV": "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "OPENCV_FISHEYE": "OPENCV_FISHEYE",
+    "THIN_PRISM_FISHEYE": "THIN_PRISM_FISHEYE",
+    "FOV": "FOV",
+    "EUCM": "EUCM",
+}
+"""Models whose parameters mean something else, or are more."""
+_WITHOUT_ZERO = ("FOV", "EUCM")
+"""Without distortion they are no lens, or none of the kind."""
 _MAX_FITTED = 8_000
 """Observations that the fit takes: 14 to 18 numbers need no more."""
 
@@ -51,18 +62,21 @@ def fit_central(
     """
     if isinstance(camera.port, NoPort):
         return None
-    lens = camera.lens.copy()
+    lens, model = camera.lens.copy(), camera.camera.model_name
     if isinstance(camera.port, FlatPort):
         lens[:2] *= camera.port.n_water
         lens[4:NUM_PARAMS] = 0.0  # of other angles: what it is in water is fitted
-    return _fitted(_with_distortion(camera, lens, NoPort()), points_in_cam, xy)
+        model = _LEAST_MODEL if model in _WITHOUT_ZERO else model
+    base = _with_distortion(camera, lens, NoPort(), model)
+    return _fitted(base, points_in_cam, xy)
 
 
 def fit_lens(
     camera: RefractiveCamera, points_in_cam: Array, xy: Array
 ) -> FittedCamera | None:
     """The same with the port as it is: as free as `fit_central`, rays that bend."""
-    base = _with_distortion(camera, camera.lens, camera.port)
+    model = camera.camera.model_name
+    base = _with_distortion(camera, camera.lens, camera.port, model)
     return _fitted(base, points_in_cam, xy)
 
 
@@ -98,12 +112,10 @@ def _fitted(
 
 
 def _with_distortion(
-    camera: RefractiveCamera, lens: Array, port: Port
+    camera: RefractiveCamera, lens: Array, port: Port, model: str
 ) -> RefractiveCamera:
-    """A lens row behind a port, as a model that has all usual distortion."""
-    model = camera.camera.model_name
-    if model not in _LARGER_MODELS:
-        model = _LEAST_MODEL
+    """A lens row of a model behind a port, as one that has all usual distortion."""
+    model = _LARGER_MODELS.get(model, _LEAST_MODEL)
     larger = pycolmap.Camera(
         model=model,
         width=camera.width,

@@ -13,7 +13,7 @@ import numpy as np
 
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.lens import FISHEYE, NUM_PARAMS
+from uwsfm.models.lens import BROWN, KIND, NUM_PARAMS, PINHOLE
 from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
@@ -299,7 +299,10 @@ def _distortion(
             given_stddev=math.nan,
         )
     ]
-    if after.lens[12] != FISHEYE:  # whose edge is far from a pinhole's, rightly
+    if after.lens[KIND] in (
+        PINHOLE,
+        BROWN,
+    ):  # a fisheye's edge is far from a pinhole's, rightly
         found.append(
             Departure(
                 camera=camera.name,
