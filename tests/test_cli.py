@@ -229,14 +229,16 @@ def test_names_are_printed_as_they_are(capsys):
 def test_unsupported_lens_is_named(tmp_path):
     run("init", "rig.yaml", cwd=tmp_path)
     text = (tmp_path / "rig.yaml").read_text()
-    text = text.replace("model: OPENCV", "model: FOV")
+    text = text.replace("model: OPENCV", "model: DIVISION")
     text = text.replace(
         "params: [1400.0, 1400.0, 960.0, 540.0, -0.1, 0.05, 0.0, 0.0]",
-        "params: [1400.0, 1400.0, 960.0, 540.0, 0.9]",
+        "params: [1400.0, 1400.0, 960.0, 540.0, -0.05]",
     )
     (tmp_path / "rig.yaml").write_text(text)
     one_sentence(
-        run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path), "'left'", "FOV"
+        run("reconstruct", "rig.yaml", ".", "-o", "out", cwd=tmp_path),
+        "'left'",
+        "DIVISION",
     )
 
 

@@ -73,6 +73,7 @@ def test_an_assumed_accuracy_of_a_shape_moves_the_corner_as_a_coefficients_does(
         rig,
         cameras=(replace(rig.cameras[0], camera=lens),),
         cam_from_rig=rig.cam_from_rig[:1],
+        baseline_m=None,
         accuracy=RigAccuracy(),
     )
     stddevs = rig.given_accuracy().stddevs[0, border.FIRST_LENS :][4:NUM_PARAMS]

@@ -66,7 +66,7 @@ def test_a_tilt_that_is_lost_in_noise_is_told():
     scene = dive(rich_motion(2), 0.2, noise_px=4.0, num_points=60)
     sentences, result = told(scene, refine_distances=False)
     for name, camera in zip(NAMES, result.covariance.cameras, strict=True):
-        begins = f"the tilt of the port of {name} is "
+        begins = f"the direction of the port of {name} is "
         sentence = next(text for text in sentences if text.startswith(begins))
         assert f"{camera.normal_stddev_deg:.2f} deg" in sentence
 

@@ -84,7 +84,7 @@ def test_what_is_not_known_of_a_housing_is_a_dash():
     data = summary(cameras=[held])
     data["scale"]["small_unit"] = "1e-3, scale arbitrary"
     _, rows = printed(housing_table(data))
-    assert [row[3] for row in rows] == ["-", "-", "2.62", "0.30", "-"]
+    assert [row[3] for row in rows] == ["-", "-", "2.620", "0.300", "-"]
     assert rows[2][4] == "-" and rows[4][1] == "distance (1e-3, scale arbitrary)"
 
 

@@ -139,14 +139,14 @@ def test_what_was_held_or_is_open_says_so():
         {"name": "k1 of left", "value": 0.01, "stddev": None, "stddev_in_all": None}
     ]
     pose = data["cameras"][1]["cam_from_rig"]
-    pose["rotation_stddev_deg"] = None
+    pose["turn_xyz_stddev_deg"] = [None] * 3
     pose["translation_stddev_m"] = [None] * 3
     rows = {(row.group, row.name): row for row in estimates(data)}
     lens = rows["left", "k1"]
     assert (lens.word, lens.stddev, lens.unit) == ("not determined", "-", "")
     turn = rows["right", "cam_from_rig turn x"]
     assert (turn.word, turn.stddev) == ("held", "-")
-    assert float(turn.stddev_in_all) == pytest.approx(0.0936, abs=6e-4)
+    assert float(turn.stddev_in_all) == pytest.approx(4.0 * 0.0114, rel=0.05)
     assert rows["right", "cam_from_rig shift x"].word == "held"
     # The water index was given then, with the port's.
     water = rows["left", "water index"]

@@ -166,7 +166,7 @@ def test_what_takes_more_of_the_residuals_is_named():
     [
         # 1.15 times a floor of 0.5 px.
         (0.55, "the lenses, as given, do not fit", "cam_from_rig, as held, does not"),
-        (0.60, "it is not the lenses alone", "it is not the placement alone"),
+        (0.60, "more than the lenses may be wrong", "more than the placement may be"),
     ],
 )
 def test_noise_that_is_left_has_another_cause(sigma, lens, placement):

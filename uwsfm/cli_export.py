@@ -80,7 +80,20 @@ def export(
         _export_pinhole(model, out, images, flat, centered is not False)
     else:
         _export_whole(model, out, to)
+    _note_verdict(model)
     typer.echo(f"wrote {out}")
+
+
+def _note_verdict(folder: Path) -> None:
+    """Files for other programs do not carry the verdict: it is told once more."""
+    from rich.markup import escape
+
+    from uwsfm.console import console
+    from uwsfm.export.files import read_summary
+    from uwsfm.export.verdict_summary import verdict_note
+
+    for note in verdict_note(read_summary(folder) or {}):
+        console.print(f"[yellow]note:[/yellow] {escape(note)}")
 
 
 @interruptible()

@@ -54,6 +54,9 @@ def print_housing(result: "HousingResult") -> None:
     print_verdict(result.summary)
     console.print(calibration_table(result.summary))
     console.print(housing_table(result.summary))
-    console.print(budget_table(result.summary))
+    if len(result.summary["error_budget"]) > 1:
+        console.print(budget_table(result.summary))
+    else:
+        console.print("No error budget: all that is given counts as exact.")
     for warning in result.summary["warnings"]:
         console.print(f"[yellow]note:[/yellow] {escape(warning)}")

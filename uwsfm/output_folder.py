@@ -102,7 +102,9 @@ def _require_same_job(out: Path, made_of: Mapping[str, str | None]) -> None:
             if None not in (value, other) and value != other:
                 raise InputError(
                     f"{out} holds the result of another job, made of {other} and not "
-                    f"of {value}: choose another folder, or delete this one first"
+                    f"of {value}: choose another folder (with a copy of {WORK} from "
+                    "here, features and matches are not made again), or delete this "
+                    "one first"
                 )
 
 

@@ -114,7 +114,7 @@ class PlainLines:
         self._stream, self._clock = stream, clock
         self._state: _State | None = None
         self._shown: tuple[str, int, int | None] | None = None
-        self._last = float("-inf")
+        self._last, self._line = float("-inf"), ""
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._watch = threading.Thread(target=self._run, daemon=True)
@@ -137,9 +137,10 @@ class PlainLines:
             now, state = self._clock(), self._state
             now_shown = (state.step, state.done, state.total)
             pause = LINE_SECONDS if now_shown != self._shown else HEARTBEAT_SECONDS
-            if now - self._last >= pause:
-                print(state.line(now), file=self._stream, flush=True)
-                self._last, self._shown = now, now_shown
+            line = state.line(now)
+            if now - self._last >= pause and line != self._line:
+                print(line, file=self._stream, flush=True)
+                self._last, self._shown, self._line = now, now_shown, line
 
     def close(self, *, complete: bool) -> None:
         """Write no more lines; what became of the job is for others to say."""

@@ -84,9 +84,9 @@ def _paper_rows(camera: dict[str, Any]) -> list[tuple[str, ...]]:
     return [
         (
             f"{key} (deg)",
-            f"{camera[f'{key}_deg']:.2f}",
-            _number(camera[f"{key}_stddev_deg"], "{:.2f}"),
-            _number(camera[f"{key}_stddev_in_all_deg"], "{:.2f}"),
+            f"{camera[f'{key}_deg']:.3f}",
+            _number(camera[f"{key}_stddev_deg"], "{:.3f}"),
+            _number(camera[f"{key}_stddev_in_all_deg"], "{:.3f}"),
             "",
         )
         for key in ("azimuth", "tilt")

@@ -37,6 +37,13 @@ def small_unit(scale_stddev: float | None) -> str:
     return "1e-3, scale arbitrary" if scale_stddev is None else "mm"
 
 
+def small_length(value: float, scale_stddev: float | None) -> str:
+    """A length in a sentence."""
+    if scale_stddev is None:
+        return f"{value:.2g} (scale arbitrary)"
+    return f"{1e3 * value:.1f} mm"
+
+
 def length_verdicts(result: CalibrationResult) -> tuple[str, ...]:
     """One sentence for everything that is doubtful about scale and place."""
     sentences = []

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.calibration.error_budget import BudgetRow, Shift
-from uwsfm.calibration.length_verdicts import length_verdicts, small_unit
+from uwsfm.calibration.length_verdicts import length_verdicts, small_length
 from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -201,7 +201,6 @@ def _distances(
     ports = [result.scene.ports[c] for c in free]
     sizes = [p.distance for p in ports if isinstance(p, FlatPort)]
     typical = float(np.mean(sizes))
-    unit = small_unit(covariance.scale_stddev)
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         strong = _strong(vector)
@@ -221,7 +220,7 @@ def _distances(
             covariance.cameras[camera].distance_stddev_m, WEAK_SHARE * size, size
         )
         cause = causes.given(own, lambda shift: abs(shift.distance_m), camera)
-        known = f"{1e3 * stddev:.1f} {unit}{each}"
+        known = f"{small_length(stddev, covariance.scale_stddev)}{each}"
         if cause is not None:
             sentences.append(
                 f"{what} {word}: standard deviation {known} in all; {cause}"
@@ -264,9 +263,9 @@ def _tilts(
             own = normal_verdict(result.covariance.cameras[c], refined)
             cause = causes.given(own, lambda shift: shift.tilt_deg, c)
             sentences.append(
-                f"the tilt of the port of {names[c]} is {word}: standard deviation "
-                f"{camera.normal_stddev_deg:.2f} deg"
-                f"{'' if cause is None else ' in all'}; "
+                f"the direction of the port of {names[c]} is {word}: standard "
+                f"deviation {camera.normal_stddev_deg:.2f} deg, of both tilts together"
+                f"{'' if cause is None else ', in all'}; "
                 f"{cause or 'more points or frames would help'}"
             )
     return sentences
@@ -275,7 +274,6 @@ def _tilts(
 def _centers(
     result: CalibrationResult, names: Sequence[str], causes: _Causes
 ) -> list[str]:
-    unit = small_unit(result.covariance.scale_stddev)
     sentences = []
     for c, camera in enumerate(result.covariance.judged_cameras):
         port = result.scene.ports[c]
@@ -284,13 +282,16 @@ def _centers(
         refined = bool(result.covariance.border_cols[c, border.CENTER][0] != HELD)
         word = center_verdict(port.radius, camera, refined)
         if word in ("weakly determined", "not determined"):
-            x, y, z = (1e3 * value for value in camera.center_stddev_m)
+            known = ", ".join(
+                small_length(value, result.covariance.scale_stddev)
+                for value in camera.center_stddev_m
+            )
             own = center_verdict(port.radius, result.covariance.cameras[c], refined)
             cause = causes.given(own, lambda s: math.hypot(*s.center_m), c)
             advice = "hold it if it was measured better, or add nearer points and more"
             sentences.append(
                 f"the centre of the dome of {names[c]} is {word}: standard deviation "
-                f"{x:.1f}, {y:.1f}, {z:.1f} {unit}"
+                f"{known}"
                 f"{'' if cause is None else ' in all'}; {cause or advice + ' frames'}"
             )
     return sentences

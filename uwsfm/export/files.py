@@ -48,6 +48,11 @@ def read_model(folder: str | Path) -> Model:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
+    if not (folder / SPARSE).is_dir() and (folder / WORK).is_dir():
+        raise InputError(
+            f"{folder} holds no result yet: its run was stopped; give the same command "
+            "again, which goes on"
+        )
     reconstruction = read_reconstruction(folder / SPARSE)
     check_checksums(folder / HOUSING)
     return from_reconstruction(reconstruction, load_rig(folder / HOUSING))

@@ -119,7 +119,8 @@ def _comments(
     if index > 0 and calibration.options.refine_cam_from_rig:
         lines.append(
             f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg from the "
-            f"images, {in_all.rotation_stddev_deg:.4f} in all"
+            f"images, {in_all.rotation_stddev_deg:.4f} in all, of the whole angle; "
+            "rotation_deg below is per axis"
         )
     return lines
 

@@ -219,8 +219,9 @@ def _source(summary: dict[str, Any]) -> str:
         )
     text = f"Its scale comes from {', and from '.join(sources)}."
     if baseline is not None and stddev == 0.0 and len(sources) == 1:
-        text += " One per cent wrong there is one per cent wrong everywhere; the error "
-        text += "budget shows how well it is known."
+        text += " One per cent wrong there is one per cent wrong everywhere"
+        known = len(summary.get("error_budget", ())) > 1
+        text += "; the error budget shows how well it is known." if known else "."
     return text
 
 

@@ -166,7 +166,10 @@ def _equal_but(found: dict[str, set[str]]) -> str:
 def _images_of(image_dir: Path, folder: str, camera: str) -> set[str]:
     path = image_dir / folder
     if not path.is_dir():
-        raise InputError(f"folder {path} of camera {camera!r} does not exist")
+        raise InputError(
+            f"folder {path} of camera {camera!r} does not exist; a camera that took no "
+            "images is left out of the rig file"
+        )
     names = {
         item.name
         for item in path.iterdir()

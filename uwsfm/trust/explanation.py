@@ -196,13 +196,13 @@ def _port_evidence(base: Tried, one: Tried) -> list[str]:
     ]
     if not before or base.strain < 1.0:
         return []
-    text = f"ports at {_millimetres(before)}"
+    text = f"in this test of a sample, ports at {_millimetres(before)}"
     if after and np.allclose(before, after, rtol=0.1, atol=1e-3):
         return []
     if after:
         text += f" become {_millimetres(after)} (rig file: {_millimetres(given)})"
         return [text]
-    return [f"{text} are no more needed"]
+    return [f"{text} are no longer needed"]
 
 
 def _turn_evidence(base: Tried, one: Tried) -> list[str]:

@@ -237,7 +237,7 @@ class FreedWords(NamedTuple):
 
     name: str
     alone: str
-    """After "it is not the", where something else is wrong as well."""
+    """After "more than the", where something else may be wrong as well."""
     verdict: str
 
 
@@ -245,13 +245,13 @@ LENSES, PLACEMENT = "lenses_do_not_fit", "placement_does_not_fit"
 FREED_WORDS = {
     LENSES: FreedWords(
         "lenses",
-        "lenses alone; check the placement of the cameras",
+        "lenses",
         "the lenses, as given, do not fit, or something that a lens can stand for; "
         "check their calibration.",
     ),
     PLACEMENT: FreedWords(
         "placement of the cameras",
-        "placement alone; check the lenses",
+        "placement",
         "cam_from_rig, as held, does not fit, or something that it can stand for; "
         "check it, or write refine_cam_from_rig: true.",
     ),
@@ -283,8 +283,8 @@ def _freed_text(freed: Freed, words: FreedWords, floor: NoiseFloor | None) -> st
         return text + words.verdict
     return text + (
         f"but a noise of {freed.sigma_px:.2g} px is left, where matches of pairs of "
-        f"images alone have {floor.floor_px:.2g} px, so it is not the {words.alone} "
-        "and the ports as well."
+        f"images alone have {floor.floor_px:.2g} px: more than the {words.alone} may "
+        "be wrong, or it is so far off that freeing it does not find the way back."
     )
 
 
@@ -304,7 +304,8 @@ def _chance(p_value: float) -> str:
     """Far below what anyone counts, the digits mean nothing."""
     if p_value < 1e-9:
         return "chance explains less than 1 in 10^9"
-    return f"chance explains it 1 in {1.0 / p_value:.1g} times"
+    times = float(f"{1.0 / p_value:.1g}")
+    return f"chance explains it 1 in {times:,.0f} times"
 
 
 def _below_zero(goodness: Goodness) -> list[Reason]:
@@ -313,8 +314,8 @@ def _below_zero(goodness: Goodness) -> list[Reason]:
     if z is None or z < BELOW_ZERO:
         return []
     text = (
-        "The images put ports behind their cameras, where none is, so their distances "
-        f"were held at zero; that costs {z:.0f} standard deviations, so the images "
+        "The images put a port behind its camera, where none is, and its distance "
+        f"was held at zero; that costs {z:.0f} standard deviations, so the images "
         "contradict the lens calibrated in air, the water index or the kind of port."
     )
     return [reason("distance_at_zero", text, DOUBTFUL, z=z)]

@@ -138,7 +138,7 @@ class _Search:
             best, rival = _better(best, growing)
             if self._in_doubt(best, rival) and num_again < MAX_AGAIN:
                 num_again += 1
-                self.step = f"mapping anew (start {num_again + 1})"
+                self.step = f"mapping anew, as errors are large (start {num_again + 1})"
                 continue
             best.num_starts, num_again = num_again + 1, 0
             self.step = "mapping what is left"
