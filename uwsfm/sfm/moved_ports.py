@@ -20,6 +20,7 @@ from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between
 from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort, Port
+from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.epipolar import ray_pairs, relative_pose
@@ -42,6 +43,18 @@ MAX_BEHIND_M = 0.01
 """A distance may come out below zero, its bound, by what noise does to it."""
 MAX_MISFIT = 1e-3
 """Radians, median over all matches: half a pixel, noise and wrong matches included."""
+MAX_STRAIN = 2.5
+"""Two ports that both tilt by 12 degrees, and are a hand's breadth from the ruler's
+distance: more is another mistake."""
+NEARLY_ALL = 0.8
+"""Of the matches, 15 % of which may be wrong and lie anywhere."""
+MIN_SHARE = 0.25
+"""Of the matches must have points in front of both cameras to begin with: ports that
+tilt away from each other make far points meet behind them."""
+FEW_IN_FRONT = 0.9
+BEGINNINGS_DEG = (-10.0, -5.0, 5.0, 10.0)
+"""Of each port, along the baseline: the rays of two that lean by ten degrees away from
+each other are turned by five."""
 LOSS_PX = 3.0
 QUINTILE = 1.9
 """Fourth quintile over median of |x| for normal x."""
@@ -58,6 +71,22 @@ class MovedPorts:
     strain: float
     """How far the ports moved, in the standard deviations of `FREEDOM`, all together:
     root of the sum of squares."""
+    in_front: float
+    """Share of the points that lie in front of both then."""
+
+    @property
+    def explain(self) -> bool:
+        """Whether the two cameras fit their matches with them."""
+        return self.misfit <= MAX_MISFIT
+
+    @property
+    def are_likely(self) -> bool:
+        """Whether they do so for nearly all matches, and are ports as housings have."""
+        return (
+            self.typical <= MAX_MISFIT
+            and self.in_front >= NEARLY_ALL
+            and self.strain <= MAX_STRAIN
+        )
 
 
 def typical_angle(angles: Array) -> float:
@@ -66,18 +95,6 @@ def typical_angle(angles: Array) -> float:
     median as it is. NaN counts as far off."""
     sizes = np.nan_to_num(np.abs(angles), nan=np.pi)
     return float(max(np.median(sizes), np.quantile(sizes, 0.8) / QUINTILE))
-
-
-def ports_explain(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> bool:
-    """Whether ports that moved and tilted make two cameras fit their matches.
-
-    Args:
-        rig: As given.
-        cam_from_rig: Poses (C, 7) of its cameras.
-        pair: Matches of two of them, of the same frames.
-    """
-    moved = moved_ports(rig, cam_from_rig, pair)
-    return moved is not None and moved.misfit <= MAX_MISFIT
 
 
 def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts | None:
@@ -91,8 +108,8 @@ def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts 
     Returns:
         None: too few points are in front of both, or no housing has such ports.
     """
-    scene = _one_frame(rig, cam_from_rig, pair)
-    if scene.num_points < len(pair.xy_a[:: _step(pair)]) // 2:
+    scene, given = _begun(rig, cam_from_rig, pair)
+    if scene.num_points < MIN_SHARE * len(pair.xy_a[:: _step(pair)]):
         return None
     settings = CalibrateOptions.parsed(FREEDOM)
     columns = settings.border_columns(scene.cameras, np.zeros(2, dtype=bool))
@@ -107,7 +124,7 @@ def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts 
         build_layout(scene, columns),
         State.from_scene(scene),
         options,
-        border_priors(scene, settings, columns, 1.0),
+        border_priors(given, settings, columns, 1.0),
     ).state
     ports = state.ports.copy()
     behind = (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
@@ -126,12 +143,13 @@ def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts 
     angles = np.nan_to_num(np.abs(rays.epipolar_angles()), nan=np.pi)
     moves = [
         _moves(before, after)
-        for before, after in zip(scene.ports, found.ports, strict=True)
+        for before, after in zip(given.ports, found.ports, strict=True)
     ]
     return MovedPorts(
         misfit=float(np.median(angles)),
         typical=typical_angle(angles),
         strain=float(np.linalg.norm(moves)),
+        in_front=float(np.mean(rays.triangulate()[1])),
     )
 
 
@@ -163,16 +181,59 @@ def _possible(port: object) -> bool:
     return True
 
 
-def _one_frame(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> Scene:
+def _begun(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> tuple[Scene, Scene]:
+    """Two cameras and their matches to move the ports of, and the same as given.
+
+    Where few points lie in front of both, ports that are tilted against each other,
+    along the baseline, are tried to begin with: rays that diverge have no points.
+    """
+    both = rig.refractive_cameras()
+    cameras = both[pair.camera_a], both[pair.camera_b]
+    b_from_a = relative_pose(cam_from_rig, pair.camera_a, pair.camera_b)
+    scene = _one_frame(cameras, b_from_a, pair)
+    if scene.num_points < FEW_IN_FRONT * len(pair.xy_a[:: _step(pair)]):
+        tilted = [_tilted(cameras, b_from_a, angle) for angle in BEGINNINGS_DEG]
+        others = [_one_frame(each, b_from_a, pair) for each in tilted]
+        scene = max([scene, *others], key=lambda one: one.num_points)
+    return scene, replace(scene, cameras=cameras)
+
+
+def _tilted(
+    cameras: tuple[RefractiveCamera, RefractiveCamera],
+    b_from_a: Array,
+    angle_deg: float,
+) -> tuple[RefractiveCamera, RefractiveCamera]:
+    """Flat ports that lean along the baseline, by opposite angles."""
+    along = rigid3.inverse(b_from_a)[4:].copy()
+    along[2] = 0.0
+    along /= max(float(np.linalg.norm(along)), 1e-12)
+    first, second = (
+        camera.with_port(_leaning(camera.port, sign * math.radians(angle_deg) * along))
+        for camera, sign in zip(cameras, (1.0, -1.0), strict=True)
+    )
+    return first, second
+
+
+def _leaning(port: Port, by: Array) -> Port:
+    if not isinstance(port, FlatPort):
+        return port
+    x, y, z = (np.asarray(port.normal) + by).tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    return replace(port, normal=(x / length, y / length, z / length))
+
+
+def _one_frame(
+    cameras: tuple[RefractiveCamera, RefractiveCamera],
+    b_from_a: Array,
+    pair: PairMatches,
+) -> Scene:
     """Two cameras and their matches, all as if of one frame: a pose moves nothing.
     Only points in front of both are kept."""
-    both = rig.refractive_cameras()
     step = _step(pair)
     xy_a, xy_b = pair.xy_a[::step], pair.xy_b[::step]
     num = len(xy_a)
-    b_from_a = relative_pose(cam_from_rig, pair.camera_a, pair.camera_b)
     scene = Scene(
-        cameras=(both[pair.camera_a], both[pair.camera_b]),
+        cameras=cameras,
         cam_from_rig=np.stack([rigid3.IDENTITY, b_from_a]),
         rig_from_world=rigid3.IDENTITY[None],
         points=np.empty((num, 3)),

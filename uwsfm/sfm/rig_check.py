@@ -16,7 +16,7 @@ from uwsfm.rig import Rig
 from uwsfm.sfm.epipolar import relative_pose
 from uwsfm.sfm.lens_mistakes import focal_corrections
 from uwsfm.sfm.mirrored_camera import mirrored_camera
-from uwsfm.sfm.moved_ports import ports_explain
+from uwsfm.sfm.moved_ports import moved_ports
 from uwsfm.sfm.relative_pose import estimate_relative_pose
 from uwsfm.sfm.rig_ideas import (
     MAX_MISFIT,
@@ -89,7 +89,7 @@ def check_rig(
         names = rig.cameras[a].name, rig.cameras[b].name
         found = remedies(rig, cam_from_rig, pair, shifted) or _apart(rig, pair)
         turned = in_front >= MIN_IN_FRONT and misfit <= MOST_OF_PORTS
-        if turned and _may_be_ports(rig, cam_from_rig, pair, found):
+        if _may_be_ports(rig, cam_from_rig, pair, found if turned else None):
             continue
         if found:
             evidence = (
@@ -145,7 +145,8 @@ def check_rotation(
         pair = max(seen, key=len)
     a, b = rig.cameras[pair.camera_a].name, rig.cameras[pair.camera_b].name
     found = remedies(rig, cam_from_rig, pair, shifted) or _apart(rig, pair)
-    if turn <= MOST_OF_PORTS_DEG and _may_be_ports(rig, cam_from_rig, pair, found):
+    by_ports = found if turn <= MOST_OF_PORTS_DEG else None
+    if _may_be_ports(rig, cam_from_rig, pair, by_ports):
         return
     if found:
         raise ExplainedInputError(
@@ -236,12 +237,28 @@ def _placed(rig: Rig, pair: PairMatches) -> float:
 
 
 def _may_be_ports(
-    rig: Rig, cam_from_rig: Array, pair: PairMatches, found: Mapping[str, str]
+    rig: Rig, cam_from_rig: Array, pair: PairMatches, found: Mapping[str, str] | None
 ) -> bool:
     """Whether the ports explain it as well as what was ``found``: a focal length looks
-    like a port distance, and a turn of a camera or a frame's motion like a tilt."""
-    similar = set(found) <= {"focal", "frames_shifted", "rotation"}
-    return similar and ports_explain(rig, cam_from_rig, pair)
+    like a port distance, and a turn of a camera or a frame's motion like a tilt. Ports
+    that are likely and leave noise alone go before anything else.
+
+    Args:
+        rig: As given.
+        cam_from_rig: Poses (C, 7) of its cameras.
+        pair: Matches of two of them.
+        found: As of `remedies`; None: the cameras turn more than most ports can turn
+            them, so that only likely ones count.
+    """
+    moved = moved_ports(rig, cam_from_rig, pair)
+    if moved is None or not moved.explain:
+        return False
+    similar = found is not None and set(found) <= {
+        "focal",
+        "frames_shifted",
+        "rotation",
+    }
+    return similar or moved.are_likely
 
 
 def _misfit_error(name_a: str, name_b: str, misfit: float) -> InputError:
