@@ -23,7 +23,7 @@ from uwsfm.sfm.rig_check import (
 )
 from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
 from uwsfm.sfm.same_frame import PairMatches
-from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
+from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig, tilted_normal
 from uwsfm.trust.mistakes import shifted
 
 slow = pytest.mark.slow
@@ -86,6 +86,31 @@ def test_a_right_rig_passes_though_its_domes_are_off_their_centres():
     rotation = turned(known, poses_of(known), pair)
     check_rotation(known, poses_of(known), rotation, [pair])
     assert rotation.turn_deg.max() > MAX_TURN_DEG  # what a flat port would not pass
+
+
+@pytest.mark.parametrize(
+    "tilts",
+    [
+        # Away from each other, so that far points meet behind the cameras.
+        ((10.0, 0.0), (11.0, 180.0)),
+        ((10.0, 180.0), (11.0, 0.0)),
+        # Across the baseline: the rays miss each other by five degrees.
+        ((9.0, 90.0), (11.5, -90.0)),
+    ],
+)
+def test_ports_that_lean_against_each_other_are_no_mistake(rig, tilts):
+    """Ten degrees are a badly mounted port; several mistakes look like two of them."""
+    ports = [
+        replace(item.port, normal=tilted_normal(*tilt))
+        for item, tilt in zip(rig.cameras, tilts, strict=True)
+    ]
+    cameras = tuple(
+        replace(item, port=port) for item, port in zip(rig.cameras, ports, strict=True)
+    )
+    pair = same_frame_matches(simulated_dive(replace(rig, cameras=cameras)).scene)
+    poses = poses_of(rig)
+    check_rig(rig, poses, [pair])
+    check_rotation(rig, poses, turned(rig, poses, pair), [pair])
 
 
 def test_swapped_images_are_recognised(rig, pair):

@@ -1,6 +1,6 @@
 """Correct inputs: random rigs and dives. How many are called fitting, and z-scores.
 
-    python pipelines/trust/correct.py -o OUT [--runs 200]
+    python pipelines/trust/correct.py -o OUT [--runs 260]
 
 The rig file has exact lenses, straight ports and ruler readings of their distances; the
 matches have noise, and 15 % of them are wrong. A run that was stopped goes on.
@@ -31,7 +31,7 @@ from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import rough_port, tilted_normal
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
 
-RUNS = 200
+RUNS = 260
 SIZES = ((640, 480), (800, 600), (960, 540), (1200, 900), (1600, 1200))
 
 

@@ -8,6 +8,7 @@ The adjustment will find such ports; a rig is not to be refused for them.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,20 +98,33 @@ def typical_angle(angles: Array) -> float:
     return float(max(np.median(sizes), np.quantile(sizes, 0.8) / QUINTILE))
 
 
-def moved_ports(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> MovedPorts | None:
+def moved_ports(
+    rig: Rig, cam_from_rig: Array, pair: PairMatches, *, leaning: bool = False
+) -> MovedPorts | None:
     """Move the ports of two cameras until they fit their matches best.
 
     Args:
         rig: As given.
         cam_from_rig: Poses (C, 7) of its cameras, which stay.
         pair: Matches of two of them, of the same frames.
+        leaning: Where few points lie in front of both, begin with ports that lean
+            against each other as well: rays that diverge have no points.
 
     Returns:
         None: too few points are in front of both, or no housing has such ports.
     """
-    scene, given = _begun(rig, cam_from_rig, pair)
-    if scene.num_points < MIN_SHARE * len(pair.xy_a[:: _step(pair)]):
-        return None
+    best: MovedPorts | None = None
+    for scene, given in _beginnings(rig, cam_from_rig, pair, leaning):
+        found = _moved(scene, given, pair)
+        if found is not None and (best is None or found.typical < best.typical):
+            best = found
+        if best is not None and best.are_likely:
+            break
+    return best
+
+
+def _moved(scene: Scene, given: Scene, pair: PairMatches) -> MovedPorts | None:
+    """From one beginning; ``given`` has the ports as given."""
     settings = CalibrateOptions.parsed(FREEDOM)
     columns = settings.border_columns(scene.cameras, np.zeros(2, dtype=bool))
     options = LevenbergMarquardtOptions(
@@ -181,21 +195,23 @@ def _possible(port: object) -> bool:
     return True
 
 
-def _begun(rig: Rig, cam_from_rig: Array, pair: PairMatches) -> tuple[Scene, Scene]:
-    """Two cameras and their matches to move the ports of, and the same as given.
-
-    Where few points lie in front of both, ports that are tilted against each other,
-    along the baseline, are tried to begin with: rays that diverge have no points.
-    """
+def _beginnings(
+    rig: Rig, cam_from_rig: Array, pair: PairMatches, leaning: bool
+) -> Iterator[tuple[Scene, Scene]]:
+    """Two cameras and their matches to move the ports of, and the same as given."""
     both = rig.refractive_cameras()
     cameras = both[pair.camera_a], both[pair.camera_b]
     b_from_a = relative_pose(cam_from_rig, pair.camera_a, pair.camera_b)
+    count = len(pair.xy_a[:: _step(pair)])
     scene = _one_frame(cameras, b_from_a, pair)
-    if scene.num_points < FEW_IN_FRONT * len(pair.xy_a[:: _step(pair)]):
-        tilted = [_tilted(cameras, b_from_a, angle) for angle in BEGINNINGS_DEG]
-        others = [_one_frame(each, b_from_a, pair) for each in tilted]
-        scene = max([scene, *others], key=lambda one: one.num_points)
-    return scene, replace(scene, cameras=cameras)
+    scenes = [scene]
+    if leaning and scene.num_points < FEW_IN_FRONT * count:
+        tilted = (_tilted(cameras, b_from_a, angle) for angle in BEGINNINGS_DEG)
+        scenes += [_one_frame(each, b_from_a, pair) for each in tilted]
+    scenes.sort(key=lambda one: -one.num_points)
+    for each in scenes:
+        if each.num_points >= MIN_SHARE * count:
+            yield each, replace(each, cameras=cameras)
 
 
 def _tilted(

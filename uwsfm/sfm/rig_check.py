@@ -250,7 +250,7 @@ def _may_be_ports(
         found: As of `remedies`; None: the cameras turn more than most ports can turn
             them, so that only likely ones count.
     """
-    moved = moved_ports(rig, cam_from_rig, pair)
+    moved = moved_ports(rig, cam_from_rig, pair, leaning=True)
     if moved is None or not moved.explain:
         return False
     similar = found is not None and set(found) <= {
