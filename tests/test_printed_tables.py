@@ -6,7 +6,7 @@ import pytest
 from hand_made import flat_camera, numbers, printed, quantity, summary, unit_in
 
 from uwsfm.batch import Outcome
-from uwsfm.console import print_verdict
+from uwsfm.console import NO_CAUSE, ProgressBars, console, errors, print_verdict
 from uwsfm.evaluate import CameraComparison, Comparison, DomeComparison
 from uwsfm.result_tables import (
     BUDGET_ROWS,
@@ -346,3 +346,48 @@ def test_the_verdict_is_printed_with_every_reason_and_cause(capsys):
     ]
     print_verdict(summary())
     assert capsys.readouterr().out.startswith("Verdict: fits.")
+
+
+@pytest.mark.parametrize("causes", [None, [], ["Probably the water.", "Or the port."]])
+def test_a_verdict_is_printed_with_its_reasons_and_causes(causes):
+    """A search that found nothing is told, too; not where nothing was searched for."""
+    data = summary(verdict="doubtful", reasons=[])
+    for severity, text in (("does not fit", "A is off."), ("doubtful", "B is open.")):
+        data["reasons"].append({"severity": severity, "text": text})
+    data.pop("explanations")
+    if causes is not None:
+        data["explanations"] = [{"text": text} for text in causes]
+    with console.capture() as captured:
+        print_verdict(data)
+    first, *lines = captured.get().splitlines()
+    assert first == "Verdict: doubtful, for 2 reasons."
+    told = [NO_CAUSE] if causes == [] else causes or []
+    wanted = ["does not fit: A is off.", "doubtful: B is open."]
+    wanted += [f"cause: {text}" for text in told]
+    assert [line.rstrip() for line in lines] == [f"  {text}" for text in wanted]
+
+
+def test_a_result_that_fits_has_no_cause_to_be_told():
+    with console.capture() as captured:
+        print_verdict(summary(verdict="fits", reasons=[], explanations=[]))
+    assert "cause" not in captured.get()
+
+
+def test_progress_goes_to_standard_error_and_ends_well(monkeypatch):
+    """What was written by then is complete; what failed is not."""
+    assert errors.stderr and not console.stderr
+    ended = []
+
+    class Display:
+        def __call__(self, *_):
+            pass
+
+        def close(self, *, complete):
+            ended.append(complete)
+
+    monkeypatch.setattr("uwsfm.console.display", lambda where: Display())
+    with ProgressBars():
+        pass
+    with pytest.raises(ValueError, match="no"), ProgressBars():
+        raise ValueError("no")
+    assert ended == [True, False]

@@ -19,7 +19,7 @@ from hand_made_result import (
 
 from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg
+from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
 from uwsfm.export.summary import (
     budget_summary,
     errors_summary,
@@ -135,6 +135,31 @@ def test_the_placement_is_the_scenes_and_only_of_the_others(model, result):
         assert left["turn_xyz_stddev_in_all_deg"] == [None] * 3
         assert left["translation_stddev_m"] == [None] * 3
         assert left["translation_stddev_in_all_m"] == [None] * 3
+
+
+def test_a_turn_that_was_refined_has_its_own_deviations(model, result):
+    """And one that was held those of what was given, in all alone."""
+    columns = result.covariance.border_cols.copy()
+    columns[1, border.ROTATION] = 0, 1, 2
+    covariance = replace(result.covariance, border_cols=columns)
+    for turned in (True, False):
+        options = CalibrateOptions(refine_cam_from_rig=turned)
+        changed = replace(result, covariance=covariance, options=options)
+        own, total = turn_stddevs_deg(changed, 1)
+        assert None not in own
+        pose = housing_summary(model.rig, changed)[1]["cam_from_rig"]
+        assert pose["turn_xyz_stddev_deg"] == (own if turned else [None] * 3)
+        assert pose["turn_xyz_stddev_in_all_deg"] == total
+
+
+def test_how_well_a_lens_was_converted_is_told_as_it_is(model, result):
+    camera = model.rig.cameras[0]
+    camera = replace(camera, conversion_max_px=0.31, conversion_rms_px=0.042)
+    rig = replace(model.rig, cameras=(camera, model.rig.cameras[1]))
+    left, right = housing_summary(rig, result)
+    assert left["lens_conversion_max_px"] == 0.31
+    assert left["lens_conversion_rms_px"] == 0.042
+    assert right["lens_conversion_max_px"] is None
 
 
 def test_a_dome_and_a_bare_camera():

@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 from uwsfm.batch import Outcome, cause_of
 from uwsfm.cli import app
 from uwsfm.cli_results import NO_FIT, finish
-from uwsfm.console import NO_CAUSE, console, print_verdict
 from uwsfm.errors import InputError
 from uwsfm.export.files import HOUSING, SUMMARY, export_colmap
 from uwsfm.export.verdict_summary import verdict_line, with_verdict
@@ -161,22 +160,6 @@ def test_a_doubtful_result_has_weaker_words(dive_result):
     )
     assert {c["distance_verdict"] for c in summary["cameras"]} == {"doubtful"}
     assert verdict_line(summary) == "Verdict: doubtful, for one reason."
-
-
-@pytest.mark.parametrize("causes", [None, [], [{"text": "Probably the water."}]])
-def test_a_search_that_found_no_cause_is_told(dive_result, causes):
-    """Not told where nothing was searched for: the verdict is that it fits, or another
-    command shows what it found."""
-    reason = {"severity": "doubtful", "text": "There is too little data."}
-    summary = {**dive_result.result.summary, "verdict": "doubtful", "reasons": [reason]}
-    summary.pop("explanations")
-    if causes is not None:
-        summary["explanations"] = causes
-    with console.capture() as captured:
-        print_verdict(summary)
-    text = " ".join(captured.get().split())
-    assert (f"cause: {NO_CAUSE}" in text) == (causes == [])
-    assert ("cause: Probably the water." in text) == bool(causes)
 
 
 @pytest.mark.slow
