@@ -45,7 +45,8 @@ def maps_of_floor(rng: np.random.Generator, num: int, bump: float = 0.0):
             ranges[20:40, 20:40] -= bump
         constant = np.full(shape, SENSITIVITY, dtype=np.float32)
         calibration = np.zeros(shape, dtype=np.float32)
-        found.append(placed(camera, pose, ranges.astype("f4"), constant, calibration))
+        depth = DepthMap(ranges=ranges.astype("f4"), sensitivity=constant)
+        found.append(placed(camera, pose, depth, calibration))
     return found
 
 

@@ -18,8 +18,8 @@ from uwsfm.sfm.pixels import read_color, size_fault
 
 MIN_POINTS = 10
 """Of a frame, to know its depths from; with fewer those of all frames serve."""
-NUM_SOURCES = 4
-"""Neighbouring frames that one camera's image is swept with."""
+NUM_SOURCES = 6
+"""Neighbouring frames that one camera's image is compared with."""
 MIN_PARALLAX, GOOD_PARALLAX = 0.03, 0.12
 """Distance between frames over that of the scene."""
 DEPTH_PERCENTILES = (1.0, 99.0)

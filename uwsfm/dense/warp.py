@@ -1,0 +1,158 @@
+"""Where neighbours see what stands along an image's water rays, as a table.
+
+Exact projection through a port is iterative: far too slow for the hundreds of
+hypotheses that each pixel tries. It is smooth, though. For nodes of a grid over the
+image and levels of inverse depth the exact water ray is followed and projected into
+each neighbour; between nodes it is linear, between levels quadratic, to about 0.01 px
+(tests/test_dense_warp.py). The same numbers give the derivatives: by the pixel and by
+the inverse depth, of which the affine warp of a slanted patch is made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwsfm._jit import inner_fused
+from uwsfm.geometry import rigid3
+from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
+
+NODE_STEP = 8
+"""Pixels between nodes."""
+NUM_LEVELS = 16
+
+_F = np.float32
+_HALF, _ONE, _TWO = _F(0.5), _F(1.0), _F(2.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """A neighbouring image: its camera and where it is."""
+
+    camera: RefractiveCamera
+    from_reference: Array
+    """(7,) pose, this camera from the reference camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WarpTable:
+    """Of an image (h, w) and its S neighbours."""
+
+    nodes: NDArray[np.float32]
+    """(S, rows, columns, levels, 3): x and y in the neighbour, pixel centres at
+    integers, and the inverse depth there. Node (i, j) is pixel (8 i, 8 j); NaN where a
+    neighbour sees nothing."""
+    levels: NDArray[np.float32]
+    """(2,) the first inverse depth, and the step to the next."""
+
+
+def warp_table(
+    camera: RefractiveCamera,
+    neighbours: list[Placement],
+    near: float,
+    far: float,
+) -> WarpTable:
+    """Tabulate the exact projections.
+
+    Args:
+        camera: of the image.
+        neighbours: S of them.
+        near, far: depths along the camera's axis, metres.
+    """
+    counts = table_shape(camera)
+    y, x = (NODE_STEP * np.arange(n) + 0.5 for n in counts)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    origins, dirs = camera.ray_from_img(xy)
+    inverse = np.linspace(1.0 / far, 1.0 / near, NUM_LEVELS)
+    depth = 1.0 / inverse
+    along = (depth - origins[:, 2:]) / dirs[:, 2:]  # (N, levels)
+    points = origins[:, None] + along[..., None] * dirs[:, None]
+    nodes = np.empty((len(neighbours), *counts, NUM_LEVELS, 3), dtype=np.float32)
+    for table, neighbour in zip(nodes, neighbours, strict=True):
+        there = rigid3.transform(neighbour.from_reference, points.reshape(-1, 3))
+        seen, valid = neighbour.camera.img_from_point(there)
+        valid &= there[:, 2] > 0.0
+        with np.errstate(divide="ignore"):
+            found = np.column_stack([seen - 0.5, 1.0 / there[:, 2]])
+        found[~valid] = np.nan
+        table[:] = found.reshape(table.shape)
+    step = inverse[1] - inverse[0]
+    return WarpTable(nodes=nodes, levels=np.array([inverse[0], step], dtype=np.float32))
+
+
+def table_shape(camera: RefractiveCamera) -> tuple[int, int]:
+    """Rows and columns of nodes: they reach the last pixel."""
+    return -(-camera.height // NODE_STEP) + 1, -(-camera.width // NODE_STEP) + 1
+
+
+def table_bytes(camera: RefractiveCamera, num_neighbours: int) -> float:
+    """Of a table, and of what it takes to make it."""
+    rows, columns = table_shape(camera)
+    return rows * columns * NUM_LEVELS * (12.0 * num_neighbours + 200.0)
+
+
+@inner_fused
+def warped(nodes, levels, x, y, w):
+    """Where one neighbour sees the point of pixel (x, y) at inverse depth w.
+
+    Args:
+        nodes: (rows, columns, levels, 3) of the neighbour.
+        levels: (2,) as in `WarpTable`.
+        x, y: pixel, centres at integers.
+        w: inverse depth.
+
+    Returns:
+        x, y, inverse depth there (NaN: not seen), and their derivatives by x, by y and
+        by w: 12 float32.
+    """
+    step = _F(NODE_STEP)
+    at_x, at_y = x / step, y / step
+    j = min(max(int(at_x), 0), nodes.shape[1] - 2)
+    i = min(max(int(at_y), 0), nodes.shape[0] - 2)
+    fx, fy = at_x - _F(j), at_y - _F(i)
+    t = (w - levels[0]) / levels[1]
+    k = min(max(int(t + _HALF), 1), nodes.shape[2] - 2)
+    s = t - _F(k)
+    l0, l1, l2 = _HALF * s * (s - _ONE), _ONE - s * s, _HALF * s * (s + _ONE)
+    d0, d1, d2 = s - _HALF, -_TWO * s, s + _HALF
+    u, ux, uy, uw = _mixed(nodes, i, j, k, 0, fx, fy, l0, l1, l2, d0, d1, d2)
+    v, vx, vy, vw = _mixed(nodes, i, j, k, 1, fx, fy, l0, l1, l2, d0, d1, d2)
+    z, zx, zy, zw = _mixed(nodes, i, j, k, 2, fx, fy, l0, l1, l2, d0, d1, d2)
+    a, b = _ONE / step, _ONE / levels[1]
+    return (
+        u,
+        v,
+        z,
+        ux * a,
+        vx * a,
+        zx * a,
+        uy * a,
+        vy * a,
+        zy * a,
+        uw * b,
+        vw * b,
+        zw * b,
+    )
+
+
+@inner_fused
+def _mixed(nodes, i, j, k, c, fx, fy, l0, l1, l2, d0, d1, d2):
+    """One number of the nodes around a pixel, and its derivatives, per step."""
+    p00, e00 = _along(nodes, i, j, k, c, l0, l1, l2, d0, d1, d2)
+    p01, e01 = _along(nodes, i, j + 1, k, c, l0, l1, l2, d0, d1, d2)
+    p10, e10 = _along(nodes, i + 1, j, k, c, l0, l1, l2, d0, d1, d2)
+    p11, e11 = _along(nodes, i + 1, j + 1, k, c, l0, l1, l2, d0, d1, d2)
+    top, bottom = p00 + fx * (p01 - p00), p10 + fx * (p11 - p10)
+    by_x = (p01 - p00) + fy * ((p11 - p10) - (p01 - p00))
+    above, below = e00 + fx * (e01 - e00), e10 + fx * (e11 - e10)
+    return top + fy * (bottom - top), by_x, bottom - top, above + fy * (below - above)
+
+
+@inner_fused
+def _along(nodes, i, j, k, c, l0, l1, l2, d0, d1, d2):
+    """Of one node, between levels: value and derivative."""
+    a, b, e = nodes[i, j, k - 1, c], nodes[i, j, k, c], nodes[i, j, k + 1, c]
+    return l0 * a + l1 * b + l2 * e, d0 * a + d1 * b + d2 * e
