@@ -22,9 +22,9 @@ from uwsfm.dense.views import (
     cam_from_world,
     image_path,
     load_image,
+    mono_views,
     slabs_of,
     stereo_views,
-    sweep_views,
 )
 from uwsfm.errors import InputError
 from uwsfm.export.files import WORK
@@ -81,7 +81,7 @@ class DepthMaps:
         if len(self.model.scene.cameras) > 1:
             self.views, self.refused = stereo_views(self.model)
         else:
-            self.views = sweep_views(self.model)
+            self.views = mono_views(self.model)
         self._work = result.folder / WORK / FOLDER
         pixels = MAX_PIXELS[quality]
         self._mono: MonoMaps | None = None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.colmap import Model
-from uwsfm.dense.depth_map import DepthMap, Plane, read_planes, write_planes
+from uwsfm.dense.depth_map import DepthMap, read_planes, write_planes
 from uwsfm.dense.patchmatch_depth import (
     Hypotheses,
     Neighbour,
@@ -32,7 +32,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.steps import fingerprint
 
-FORMAT = 1
+FORMAT = 2
 """Of the hypotheses and of what is made of them: others are made again."""
 
 
@@ -43,7 +43,7 @@ class MonoMaps:
         model: the reconstruction.
         images: folder of its images.
         work: folder of the hypotheses.
-        views: those of `sweep_views`.
+        views: those of `mono_views`.
         max_pixels: larger images are reduced by a whole number.
     """
 
@@ -85,15 +85,11 @@ class MonoMaps:
         """The second pass; the first must have been made of all views."""
         view = self._views[index]
         found = [self._hypotheses(other) for other in view.others]
-        shapes = [self.camera(camera) for camera, _ in view.others]
-        nothing = [np.full((c.height, c.width), np.nan, "f4") for c in shapes]
-        inverse = [
-            empty if planes is None else np.ascontiguousarray(planes[..., 0])
-            for planes, empty in zip(found, nothing, strict=True)
-        ]
+        nothing = np.full((1, 1, 3), np.nan, dtype=np.float32)
+        known = [nothing if planes is None else planes for planes in found]
         planes = self._hypotheses((view.camera, view.frame))
         assert planes is not None, "the first pass comes first"
-        settled = self._patchmatch(index, inverse).settled(planes)
+        settled = self._patchmatch(index, known).settled(planes)
         return depth_map_of(self.camera(view.camera), *settled)
 
     def key(self, index: int) -> str:
@@ -127,16 +123,19 @@ class MonoMaps:
         images = 4.0 * full.width * full.height  # one at a time, read and grey
         return images + patchmatch_bytes(self.camera(view.camera), len(view.others))
 
-    def _patchmatch(self, index: int, inverse: list[Plane] | None = None) -> PatchMatch:
+    def _patchmatch(
+        self, index: int, planes: list[Hypotheses] | None = None
+    ) -> PatchMatch:
         view = self._views[index]
-        known = [None] * len(view.others) if inverse is None else inverse
+        nothing: list[Hypotheses | None] = [None] * len(view.others)
+        known = nothing if planes is None else planes
         neighbours = [
             Neighbour(
                 placement=Placement(camera=self.camera(camera), from_reference=pose),
                 image=self._gray(camera, name),
-                inverse=plane,
+                planes=found,
             )
-            for (camera, _), name, pose, plane in zip(
+            for (camera, _), name, pose, found in zip(
                 view.others, view.other_names, self._poses(view), known, strict=True
             )
         ]

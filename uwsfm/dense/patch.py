@@ -9,18 +9,18 @@ than the middle is likely another surface (Schoenberger et al., ECCV 2016).
 A hypothesis is (w, gx, gy): the inverse depth along the camera's axis of the point on
 the pixel's water ray, and how it grows per pixel. Neighbours are one tuple ``seen``:
 
-    images   (S, H * W) float32 grey levels, rows padded to the largest
-    sizes    (S, 2) rows and columns, int64
+    images   (P,) float32 grey levels, one image after the other
+    sizes    (S, 3) rows, columns and where the image begins, int64
     nodes    (S, rows, columns, levels, 3) of the `WarpTable`
     levels   (2,) of it
-    inverse  (S, H, W) float32 inverse depths that neighbours found; (S, 0, 0) if none
-    scale    (1,) float32 pixels of the table per pixel here
+    planes   (S, H, W, 3) float32 hypotheses of the neighbours; (S, 0, 0, 3) if none
+    scales   (2,) float32 pixels of the table per pixel here, and of those hypotheses
 """
 
 import numpy as np
 
-from uwsfm._jit import inner, inner_fused
-from uwsfm.dense.warp import warped
+from uwsfm._jit import inner_fused, lane
+from uwsfm.dense.warp import depth_there, warped
 
 RADIUS, STRIDE = 4, 2
 """Pixels from the middle to the last sample, and between samples."""
@@ -85,21 +85,23 @@ def take_patch(image, x, y, offsets, weights, patch):
 
 
 @inner_fused
-def _correlation(image, width, u, v, a, b, c, d, offsets, patch, deviation):
+def _correlation(images, place, u, v, a, b, c, d, offsets, patch, deviation):
     """Of a patch with what a neighbour shows at (u + a x + b y, v + c x + d y).
 
-    Rows of offsets and unsigned indices of 32 bits: so it becomes SIMD, twice as fast.
+    ``place`` is where its image begins, and its width, as uint32 and int32. Rows of
+    offsets and unsigned indices of 32 bits: so it becomes SIMD, twice as fast.
     """
+    begin, width = place
     mean, square, product = _ZERO, _ZERO, _ZERO
     for k in range(offsets.shape[1]):
         x, y = offsets[0, k], offsets[1, k]
         at_x, at_y = u + a * x + b * y, v + c * x + d * y
         j, i = np.int32(at_x), np.int32(at_y)
         fx, fy = at_x - _F(j), at_y - _F(i)
-        at = np.uint32(np.int32(i * width) + j)
+        at = np.uint32(begin + np.uint32(np.int32(i * width) + j))
         under = np.uint32(at + np.uint32(width))
-        top = image[at] + fx * (image[np.uint32(at + _NEXT)] - image[at])
-        low = image[under] + fx * (image[np.uint32(under + _NEXT)] - image[under])
+        top = images[at] + fx * (images[np.uint32(at + _NEXT)] - images[at])
+        low = images[under] + fx * (images[np.uint32(under + _NEXT)] - images[under])
         gray = top + fy * (low - top)
         weight = patch[1, k]
         mean += weight * gray
@@ -108,59 +110,77 @@ def _correlation(image, width, u, v, a, b, c, d, offsets, patch, deviation):
     return product / (deviation * np.sqrt(max(square - mean * mean, _ZERO) + _SOFT))
 
 
-@inner
+@lane
 def affine(seen, s, x, y, w, gx, gy):
     """The map of a patch into neighbour s, in its pixels at this scale.
 
     Returns:
-        u, v, inverse depth there, a, b, c, d, and by w: du, dv, and inverse depth.
+        u, v, a, b, c, d, and how u and v change with the inverse depth.
     """
-    _, _, nodes, levels, _, scales = seen
-    scale = scales[0]
-    out = warped(
-        nodes[s], levels, (_F(x) + _HALF) * scale - _HALF,
-        (_F(y) + _HALF) * scale - _HALF, w,
-    )  # fmt: skip
-    u, v, z, ux, vx, _, uy, vy, _, uw, vw, zw = out
+    scale = seen[5][0]
     shrink = _ONE / scale
+    u, v, ux, vx, uy, vy, uw, vw = warped(
+        seen[2], seen[3], s, _fine(x, scale), _fine(y, scale), w
+    )
     uw, vw = uw * shrink, vw * shrink
     # A table's pixel per pixel here goes in and comes out: ux stays.
     return (
-        (u + _HALF) * shrink - _HALF, (v + _HALF) * shrink - _HALF, z,
-        ux + uw * gx, uy + uw * gy, vx + vw * gx, vy + vw * gy, uw, vw, zw,
+        (u + _HALF) * shrink - _HALF, (v + _HALF) * shrink - _HALF,
+        ux + uw * gx, uy + uw * gy, vx + vw * gx, vy + vw * gy, uw, vw,
     )  # fmt: skip
 
 
-@inner
-def shows(size, u, v, a, b, c, d, radius):
-    """Whether a neighbour shows a patch, neither squeezed nor torn."""
+@lane
+def _fine(x, scale):
+    return (_F(x) + _HALF) * scale - _HALF
+
+
+@lane
+def shows(sizes, s, u, v, a, b, c, d, radius):
+    """Whether neighbour s shows a patch, neither squeezed nor torn."""
     across = (abs(a) + abs(b)) * radius
     down = (abs(c) + abs(d)) * radius
     zoom = a * d - b * c
     return (
         u - across >= _ZERO
         and v - down >= _ZERO
-        and u + across < _F(size[1] - 1)
-        and v + down < _F(size[0] - 1)
+        and u + across < _F(sizes[s, 1] - 1)
+        and v + down < _F(sizes[s, 0] - 1)
         and zoom > _MIN_ZOOM
         and zoom < _MAX_ZOOM
     )
 
 
-@inner
+@lane
 def view_cost(seen, s, x, y, w, gx, gy, offsets, patch, deviation):
     """One minus the correlation with neighbour s, and what its own depths object."""
-    images, sizes, _, _, inverse, _ = seen
-    u, v, z, a, b, c, d, uw, vw, zw = affine(seen, s, x, y, w, gx, gy)
-    if not shows(sizes[s], u, v, a, b, c, d, _F(RADIUS)):
+    u, v, a, b, c, d, uw, vw = affine(seen, s, x, y, w, gx, gy)
+    if not shows(seen[1], s, u, v, a, b, c, d, _F(RADIUS)):
         return WORST
+    place = np.uint32(seen[1][s, 2]), np.int32(seen[1][s, 1])
     cost = _ONE - _correlation(
-        images[s], np.int32(sizes[s, 1]), u, v, a, b, c, d, offsets, patch, deviation
+        seen[0], place, u, v, a, b, c, d, offsets, patch, deviation
     )
-    if inverse.shape[1] > 0:
-        there = inverse[s, int(v + _HALF), int(u + _HALF)]
-        # Inverse depths are compared as the pixels that they are apart here.
-        apart = abs(there - z) * np.sqrt(uw * uw + vw * vw) / max(abs(zw), _F(0.2))
-        apart = apart if apart < GEOMETRIC_LIMIT else GEOMETRIC_LIMIT  # also NaN
+    if seen[4].shape[1] > 0:
+        apart = objection(seen, s, x, y, w, u, v, uw, vw)
+        # Also where it is NaN: nothing is known there.
+        apart = apart if apart < GEOMETRIC_LIMIT else GEOMETRIC_LIMIT
         cost += GEOMETRIC_WEIGHT * apart
     return min(cost, WORST)
+
+
+@lane
+def objection(seen, s, x, y, w, u, v, uw, vw):
+    """How far neighbour s has the surface from a point that it sees at (u, v).
+
+    Inverse depths are compared as the pixels that they are apart in the neighbour; NaN
+    where it knows nothing.
+    """
+    scale, ratio = seen[5][0], seen[5][1]
+    at_x, at_y = (u + _HALF) * ratio - _HALF, (v + _HALF) * ratio - _HALF
+    j = min(max(int(at_x + _HALF), 0), seen[4].shape[2] - 1)
+    i = min(max(int(at_y + _HALF), 0), seen[4].shape[1] - 1)
+    there = seen[4][s, i, j, 0] + seen[4][s, i, j, 1] * (at_x - _F(j))
+    there += seen[4][s, i, j, 2] * (at_y - _F(i))
+    z, zw = depth_there(seen[2], seen[3], s, _fine(x, scale), _fine(y, scale), w)
+    return abs(there - z) * np.sqrt(uw * uw + vw * vw) / max(abs(zw), _F(0.2))

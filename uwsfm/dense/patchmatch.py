@@ -47,11 +47,10 @@ def _random(state):
 
 
 @inner
-def _all_costs(seen, x, y, plane, offsets, patch, deviation, found):
-    for s in range(len(found)):
-        found[s] = view_cost(
-            seen, s, x, y, plane[0], plane[1], plane[2], offsets, patch, deviation
-        )
+def _all_costs(seen, x, y, planes, offsets, patch, deviation, costs):
+    w, gx, gy = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2]
+    for s in range(costs.shape[2] - 1):
+        costs[y, x, s] = view_cost(seen, s, x, y, w, gx, gy, offsets, patch, deviation)
 
 
 @kernel
@@ -71,21 +70,19 @@ def rate(image, seen, planes, costs, tables, scratch):
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
             _, deviation = take_patch(image, x, y, offsets, weights, scratch)
-            found = costs[y, x]
-            _all_costs(
-                seen, x, y, planes[y, x], offsets, scratch, deviation, found[:num]
-            )
-            found[num] = _best_two(found, num)
+            _all_costs(seen, x, y, planes, offsets, scratch, deviation, costs)
+            costs[y, x, num] = _best_two(costs, x, y, num)
 
 
 @inner
-def _best_two(costs, num):
+def _best_two(costs, x, y, num):
     best, second = WORST, WORST
     for s in range(num):
-        if costs[s] < best:
-            best, second = costs[s], best
-        elif costs[s] < second:
-            second = costs[s]
+        cost = costs[y, x, s]
+        if cost < best:
+            best, second = cost, best
+        elif cost < second:
+            second = cost
     return _HALF * (best + second)
 
 
@@ -122,7 +119,7 @@ def choose(costs, x, y, reach, share, chosen, nearby):
         share[num + n] /= total
     if count == 0:
         # Nobody shows this: the two that show it best may be right.
-        count = _least(costs[y, x], num, chosen, share)
+        count = _least(costs, x, y, num, chosen, share)
     return count
 
 
@@ -204,12 +201,12 @@ def spread(image, seen, planes, costs, tables, chance, limits, scratch):
 
 
 @inner
-def _least(costs, num, chosen, share):
+def _least(costs, x, y, num, chosen, share):
     first, second = 0, -1
     for s in range(1, num):
-        if costs[s] < costs[first]:
+        if costs[y, x, s] < costs[y, x, first]:
             first, second = s, first
-        elif second < 0 or costs[s] < costs[second]:
+        elif second < 0 or costs[y, x, s] < costs[y, x, second]:
             second = s
     chosen[0], chosen[1] = first, max(second, 0)
     share[num], share[num + 1] = _HALF, _HALF
@@ -251,9 +248,7 @@ def _improve(seen, x, y, planes, costs, choice, nearby, own, limits, state):
     costs[y, x, num] = best
     if changed:
         planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, gx, gy
-        _all_costs(
-            seen, x, y, planes[y, x], offsets, patch, deviation, costs[y, x, :num]
-        )
+        _all_costs(seen, x, y, planes, offsets, patch, deviation, costs)
 
 
 @inner
@@ -290,5 +285,5 @@ def _by_chance(state, n, w, gx, gy, pixel, limits):
 def _pixel_of(seen, s, x, y, w):
     """Inverse depth that moves a point by a pixel in neighbour s."""
     out = affine(seen, s, x, y, w, _ZERO, _ZERO)
-    moved = np.sqrt(out[7] * out[7] + out[8] * out[8])
+    moved = np.sqrt(out[6] * out[6] + out[7] * out[7])
     return _ONE / moved if moved > _ZERO else _ONE

@@ -14,7 +14,7 @@ from uwsfm.dense.match import Gray
 from uwsfm.dense.options import ASSUMED_NOISE_PX
 from uwsfm.dense.reduced import for_scale
 from uwsfm.dense.settle import settle
-from uwsfm.dense.warp import Placement, WarpTable, table_bytes, warp_table
+from uwsfm.dense.warp import Placement, table_bytes, warp_table
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 
@@ -34,18 +34,23 @@ class Rounds:
     """Of the pixels that try any depth at all, each round."""
 
 
-COARSE_TO_FINE = (
+FIRST = (
     Rounds(scale=4, reach_px=(6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5), any_share=0.5),
     Rounds(scale=2, reach_px=(2.0, 1.0, 0.7, 0.5), any_share=0.2),
-    Rounds(scale=1, reach_px=(1.0, 0.5), any_share=0.1),
 )
-AGAIN = (Rounds(scale=1, reach_px=(0.5,), any_share=0.0),)
-"""With the neighbours' depths at hand."""
-LEAST_NOISE_PX, MAX_NOISE_PX = 0.05, 1.0
+"""By likeness alone."""
+SECOND = (
+    Rounds(scale=2, reach_px=(1.0, 0.7), any_share=0.2),
+    Rounds(scale=1, reach_px=(0.5,), any_share=0.0),
+)
+"""With what the neighbours found."""
+LEAST_NOISE_PX, SURE_NOISE_PX = 0.05, 0.5
 """Standard deviation of a disparity: what the warp, the slope and the light leave at
-best; with more a depth is not known at all."""
+best, and up to which the images alone are believed."""
 MIN_CORRELATION = 0.3
-"""Of patches. Plain ones are little alike for their noise, and agree all the same."""
+"""Of patches, likewise."""
+MIN_AGREEING = 2
+"""Neighbours that have the surface there, too: of what is plain, these decide."""
 BYTES_PER_PIXEL, BYTES_PER_NEIGHBOUR = 500, 20
 """In all passes (measured), beside the warp's table."""
 SLOPE_PER_PX = 0.3
@@ -58,8 +63,9 @@ class Neighbour:
 
     placement: Placement
     image: Gray
-    inverse: Plane | None = None
-    """(H, W) inverse depths that were found there; NaN where there are none."""
+    planes: Hypotheses | None = None
+    """That the first pass found there, of half the image's size; NaN where there are
+    none."""
 
 
 class PatchMatch:
@@ -90,7 +96,7 @@ class PatchMatch:
 
     def start(self, points: Array) -> Hypotheses:
         """From known points (N, 3): pixel x, y and inverse depth; and from chance."""
-        scale = COARSE_TO_FINE[0].scale
+        scale = FIRST[0].scale
         height, width = (-(-n // scale) for n in self._image.shape)
         rng = np.random.default_rng(self._seed)
         low, high = self._limits
@@ -105,21 +111,21 @@ class PatchMatch:
         return planes
 
     def search(self, points: Array) -> Hypotheses:
-        """From nothing but points, by likeness alone."""
+        """The first pass: from points as in `start`, to half the image's size."""
         planes = self.start(points)
-        for rounds in COARSE_TO_FINE:
+        for rounds in FIRST:
             planes, _, _ = self._run(planes, rounds)
         return planes
 
     def settled(self, planes: Hypotheses) -> tuple[Hypotheses, Plane]:
-        """Go on from hypotheses of the whole image, then Gauss-Newton.
+        """The second pass, from the first's hypotheses, then Gauss-Newton.
 
         Returns:
-            The hypotheses, and (H, W, 4) of `uwsfm.dense.settle`.
+            The hypotheses, and (H, W, 5) of `uwsfm.dense.settle`.
         """
-        for rounds in AGAIN:
+        for rounds in SECOND:
             planes, costs, seen = self._run(planes, rounds)
-        found = np.empty((*planes.shape[:2], 4), dtype=np.float32)
+        found = np.empty((*planes.shape[:2], 5), dtype=np.float32)
         offsets = patch.patch_offsets(stride=1)
         tables = offsets, patch.color_weights(), patchmatch.REACH
         image = self._image.astype(np.float32)
@@ -159,19 +165,19 @@ class PatchMatch:
     def _seen(self, scale: int) -> tuple[Any, ...]:
         """The neighbours as `uwsfm.dense.patch` wants them."""
         images = [for_scale(n.image, scale) for n in self._neighbours]
-        sizes = np.array([image.shape for image in images], dtype=np.int64)
-        flat = np.zeros((len(images), sizes.prod(axis=1).max() + 1), dtype=np.float32)
-        for row, image in zip(flat, images, strict=True):
-            row[: image.size] = image.ravel()
-        inverse = np.zeros((len(images), 0, 0), dtype=np.float32)
-        if scale == 1 and all(n.inverse is not None for n in self._neighbours):
-            inverse = np.full((len(images), *sizes.max(axis=0)), np.nan, dtype="f4")
-            for plane, n in zip(inverse, self._neighbours, strict=True):
-                height, width = n.inverse.shape  # type: ignore[union-attr]
-                plane[:height, :width] = n.inverse
-        table: WarpTable = self._table
-        scales = np.array([scale], dtype=np.float32)
-        return flat, sizes, table.nodes, table.levels, inverse, scales
+        shapes = np.array([image.shape for image in images], dtype=np.int64)
+        begins = np.cumsum([0, *(image.size for image in images[:-1])])
+        sizes = np.column_stack([shapes, begins])
+        flat = np.concatenate([image.ravel() for image in images])
+        known = [n.planes for n in self._neighbours if n.planes is not None]
+        planes = np.zeros((len(images), 0, 0, 3), dtype=np.float32)
+        if len(known) == len(images):
+            largest = np.max([found.shape[:2] for found in known], axis=0)
+            planes = np.full((len(images), *largest, 3), np.nan, dtype=np.float32)
+            for room, found in zip(planes, known, strict=True):
+                room[: found.shape[0], : found.shape[1]] = found
+        scales = np.array([scale, scale / FIRST[-1].scale], dtype=np.float32)
+        return flat, sizes, self._table.nodes, self._table.levels, planes, scales
 
 
 def depth_map_of(
@@ -182,7 +188,7 @@ def depth_map_of(
     Args:
         camera: of the image (H, W).
         planes: (H, W, 3), for the normals.
-        found: (H, W, 4) of `uwsfm.dense.settle`.
+        found: (H, W, 5) of `uwsfm.dense.settle`.
     """
     shape = found.shape[:2]
     origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
@@ -194,7 +200,9 @@ def depth_map_of(
         steps = dirs[:, 2].reshape(shape)
         ranges = (depth - origins[:, 2].reshape(shape)) / steps
         spread = np.hypot(spread, LEAST_NOISE_PX)
-        known = (likeness > MIN_CORRELATION) & (spread < MAX_NOISE_PX) & (ranges > 0.0)
+        known = (likeness > MIN_CORRELATION) & (spread < SURE_NOISE_PX)
+        known |= found[..., 4] >= MIN_AGREEING
+        known &= ranges > 0.0
         ranges[~known] = np.nan
         sensitivity = depth * depth / (steps * moves)
         sensitivity[~known] = np.nan

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._jit import inner_fused
+from uwsfm._jit import lane
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
@@ -25,7 +25,7 @@ NODE_STEP = 8
 NUM_LEVELS = 16
 
 _F = np.float32
-_HALF, _ONE, _TWO = _F(0.5), _F(1.0), _F(2.0)
+_HALF, _ONE = _F(0.5), _F(1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,65 +94,71 @@ def table_bytes(camera: RefractiveCamera, num_neighbours: int) -> float:
     return rows * columns * NUM_LEVELS * (12.0 * num_neighbours + 200.0)
 
 
-@inner_fused
-def warped(nodes, levels, x, y, w):
-    """Where one neighbour sees the point of pixel (x, y) at inverse depth w.
+@lane
+def warped(nodes, levels, s, x, y, w):
+    """Where neighbour s sees the point of pixel (x, y) at inverse depth w.
 
     Args:
-        nodes: (rows, columns, levels, 3) of the neighbour.
-        levels: (2,) as in `WarpTable`.
+        nodes: (S, rows, columns, levels, 3) of `WarpTable`.
+        levels: (2,) likewise.
+        s: neighbour.
         x, y: pixel, centres at integers.
         w: inverse depth.
 
     Returns:
-        x, y, inverse depth there (NaN: not seen), and their derivatives by x, by y and
-        by w: 12 float32.
+        x and y there (NaN: not seen), and their derivatives by x, by y and by w: eight
+        float32.
     """
-    step = _F(NODE_STEP)
-    at_x, at_y = x / step, y / step
-    j = min(max(int(at_x), 0), nodes.shape[1] - 2)
-    i = min(max(int(at_y), 0), nodes.shape[0] - 2)
-    fx, fy = at_x - _F(j), at_y - _F(i)
-    t = (w - levels[0]) / levels[1]
-    k = min(max(int(t + _HALF), 1), nodes.shape[2] - 2)
-    s = t - _F(k)
-    l0, l1, l2 = _HALF * s * (s - _ONE), _ONE - s * s, _HALF * s * (s + _ONE)
-    d0, d1, d2 = s - _HALF, -_TWO * s, s + _HALF
-    u, ux, uy, uw = _mixed(nodes, i, j, k, 0, fx, fy, l0, l1, l2, d0, d1, d2)
-    v, vx, vy, vw = _mixed(nodes, i, j, k, 1, fx, fy, l0, l1, l2, d0, d1, d2)
-    z, zx, zy, zw = _mixed(nodes, i, j, k, 2, fx, fy, l0, l1, l2, d0, d1, d2)
-    a, b = _ONE / step, _ONE / levels[1]
-    return (
-        u,
-        v,
-        z,
-        ux * a,
-        vx * a,
-        zx * a,
-        uy * a,
-        vy * a,
-        zy * a,
-        uw * b,
-        vw * b,
-        zw * b,
-    )
+    i, j, fx, fy = _cell(nodes, x, y)
+    k, t = _level(nodes, levels, w)
+    u, ux, uy, uw = _mixed(nodes, s, i, j, k, 0, fx, fy, t)
+    v, vx, vy, vw = _mixed(nodes, s, i, j, k, 1, fx, fy, t)
+    a, b = _ONE / _F(NODE_STEP), _ONE / levels[1]
+    return u, v, ux * a, vx * a, uy * a, vy * a, uw * b, vw * b
 
 
-@inner_fused
-def _mixed(nodes, i, j, k, c, fx, fy, l0, l1, l2, d0, d1, d2):
+@lane
+def depth_there(nodes, levels, s, x, y, w):
+    """Inverse depth at neighbour s of the same point, and its derivative by w."""
+    i, j, fx, fy = _cell(nodes, x, y)
+    k, t = _level(nodes, levels, w)
+    z, _, _, zw = _mixed(nodes, s, i, j, k, 2, fx, fy, t)
+    return z, zw / levels[1]
+
+
+@lane
+def _cell(nodes, x, y):
+    """Row and column of the node before a pixel, and how far behind it the pixel is."""
+    at_x, at_y = x / _F(NODE_STEP), y / _F(NODE_STEP)
+    j = min(max(int(at_x), 0), nodes.shape[2] - 2)
+    i = min(max(int(at_y), 0), nodes.shape[1] - 2)
+    return i, j, at_x - _F(j), at_y - _F(i)
+
+
+@lane
+def _level(nodes, levels, w):
+    """The middle one of three levels around an inverse depth, and how far from it."""
+    at = (w - levels[0]) / levels[1]
+    k = min(max(int(at + _HALF), 1), nodes.shape[3] - 2)
+    return k, at - _F(k)
+
+
+@lane
+def _mixed(nodes, s, i, j, k, c, fx, fy, t):
     """One number of the nodes around a pixel, and its derivatives, per step."""
-    p00, e00 = _along(nodes, i, j, k, c, l0, l1, l2, d0, d1, d2)
-    p01, e01 = _along(nodes, i, j + 1, k, c, l0, l1, l2, d0, d1, d2)
-    p10, e10 = _along(nodes, i + 1, j, k, c, l0, l1, l2, d0, d1, d2)
-    p11, e11 = _along(nodes, i + 1, j + 1, k, c, l0, l1, l2, d0, d1, d2)
+    p00, e00 = _along(nodes, s, i, j, k, c, t)
+    p01, e01 = _along(nodes, s, i, j + 1, k, c, t)
+    p10, e10 = _along(nodes, s, i + 1, j, k, c, t)
+    p11, e11 = _along(nodes, s, i + 1, j + 1, k, c, t)
     top, bottom = p00 + fx * (p01 - p00), p10 + fx * (p11 - p10)
     by_x = (p01 - p00) + fy * ((p11 - p10) - (p01 - p00))
     above, below = e00 + fx * (e01 - e00), e10 + fx * (e11 - e10)
     return top + fy * (bottom - top), by_x, bottom - top, above + fy * (below - above)
 
 
-@inner_fused
-def _along(nodes, i, j, k, c, l0, l1, l2, d0, d1, d2):
+@lane
+def _along(nodes, s, i, j, k, c, t):
     """Of one node, between levels: value and derivative."""
-    a, b, e = nodes[i, j, k - 1, c], nodes[i, j, k, c], nodes[i, j, k + 1, c]
-    return l0 * a + l1 * b + l2 * e, d0 * a + d1 * b + d2 * e
+    a, b, e = nodes[s, i, j, k - 1, c], nodes[s, i, j, k, c], nodes[s, i, j, k + 1, c]
+    slope, curve = _HALF * (e - a), e - b - (b - a)
+    return b + t * (slope + _HALF * t * curve), slope + t * curve
