@@ -32,7 +32,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.steps import fingerprint
 
-FORMAT = 2
+FORMAT = 3
 """Of the hypotheses and of what is made of them: others are made again."""
 
 

@@ -12,7 +12,7 @@ the pixel's water ray, and how it grows per pixel. Neighbours are one tuple ``se
     images   (P,) float32 grey levels, one image after the other
     sizes    (S, 3) rows, columns and where the image begins, int64
     nodes    (S, rows, columns, levels, 3) of the `WarpTable`
-    levels   (2,) of it
+    levels   (3,) of it
     planes   (S, H, W, 3) float32 hypotheses of the neighbours; (S, 0, 0, 3) if none
     scales   (2,) float32 pixels of the table per pixel here, and of those hypotheses
 """

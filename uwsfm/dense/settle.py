@@ -12,7 +12,7 @@ from uwsfm._jit import inner, inner_fused, kernel
 from uwsfm.dense.patch import RADIUS, affine, objection, shows, take_patch
 from uwsfm.dense.patchmatch import choose
 
-NUM_STEPS = 3
+NUM_STEPS = 2
 HYPOTHESIS_PX = 1.0
 """Standard deviation of a hypothesis, pixels in the neighbours."""
 AGREES_PX = 1.5

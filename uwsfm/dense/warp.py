@@ -3,9 +3,10 @@
 Exact projection through a port is iterative: far too slow for the hundreds of
 hypotheses that each pixel tries. It is smooth, though. For nodes of a grid over the
 image and levels of inverse depth the exact water ray is followed and projected into
-each neighbour; between nodes it is linear, between levels quadratic, to about 0.01 px
-(tests/test_dense_warp.py). The same numbers give the derivatives: by the pixel and by
-the inverse depth, of which the affine warp of a slanted patch is made.
+each neighbour; between nodes it is linear, between levels quadratic, to one or two
+hundredths of a pixel (tests/test_dense_warp.py). The same numbers give the derivatives:
+by the pixel and by the inverse depth, of which the affine warp of a slanted patch is
+made.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
 
-NODE_STEP = 8
-"""Pixels between nodes."""
+NODE_STEP, SMALL_STEP = 8, 4
+"""Pixels between nodes; and in small images, whose pixels are wider angles."""
+SMALL_WIDTH = 500
 NUM_LEVELS = 16
 
 _F = np.float32
@@ -43,10 +45,10 @@ class WarpTable:
 
     nodes: NDArray[np.float32]
     """(S, rows, columns, levels, 3): x and y in the neighbour, pixel centres at
-    integers, and the inverse depth there. Node (i, j) is pixel (8 i, 8 j); NaN where a
-    neighbour sees nothing."""
+    integers, and the inverse depth there; NaN where a neighbour sees nothing."""
     levels: NDArray[np.float32]
-    """(2,) the first inverse depth, and the step to the next."""
+    """(3,) the first inverse depth, the step to the next, and pixels between nodes:
+    node (i, j) is pixel (i, j) times that."""
 
 
 def warp_table(
@@ -63,7 +65,8 @@ def warp_table(
         near, far: depths along the camera's axis, metres.
     """
     counts = table_shape(camera)
-    y, x = (NODE_STEP * np.arange(n) + 0.5 for n in counts)
+    pixels = node_step(camera)
+    y, x = (pixels * np.arange(n) + 0.5 for n in counts)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     origins, dirs = camera.ray_from_img(xy)
     inverse = np.linspace(1.0 / far, 1.0 / near, NUM_LEVELS)
@@ -80,12 +83,19 @@ def warp_table(
         found[~valid] = np.nan
         table[:] = found.reshape(table.shape)
     step = inverse[1] - inverse[0]
-    return WarpTable(nodes=nodes, levels=np.array([inverse[0], step], dtype=np.float32))
+    levels = np.array([inverse[0], step, pixels], dtype=np.float32)
+    return WarpTable(nodes=nodes, levels=levels)
+
+
+def node_step(camera: RefractiveCamera) -> int:
+    """Pixels between the nodes of an image."""
+    return NODE_STEP if camera.width >= SMALL_WIDTH else SMALL_STEP
 
 
 def table_shape(camera: RefractiveCamera) -> tuple[int, int]:
     """Rows and columns of nodes: they reach the last pixel."""
-    return -(-camera.height // NODE_STEP) + 1, -(-camera.width // NODE_STEP) + 1
+    step = node_step(camera)
+    return -(-camera.height // step) + 1, -(-camera.width // step) + 1
 
 
 def table_bytes(camera: RefractiveCamera, num_neighbours: int) -> float:
@@ -100,7 +110,7 @@ def warped(nodes, levels, s, x, y, w):
 
     Args:
         nodes: (S, rows, columns, levels, 3) of `WarpTable`.
-        levels: (2,) likewise.
+        levels: (3,) likewise.
         s: neighbour.
         x, y: pixel, centres at integers.
         w: inverse depth.
@@ -109,27 +119,27 @@ def warped(nodes, levels, s, x, y, w):
         x and y there (NaN: not seen), and their derivatives by x, by y and by w: eight
         float32.
     """
-    i, j, fx, fy = _cell(nodes, x, y)
+    i, j, fx, fy = _cell(nodes, levels, x, y)
     k, t = _level(nodes, levels, w)
     u, ux, uy, uw = _mixed(nodes, s, i, j, k, 0, fx, fy, t)
     v, vx, vy, vw = _mixed(nodes, s, i, j, k, 1, fx, fy, t)
-    a, b = _ONE / _F(NODE_STEP), _ONE / levels[1]
+    a, b = _ONE / levels[2], _ONE / levels[1]
     return u, v, ux * a, vx * a, uy * a, vy * a, uw * b, vw * b
 
 
 @lane
 def depth_there(nodes, levels, s, x, y, w):
     """Inverse depth at neighbour s of the same point, and its derivative by w."""
-    i, j, fx, fy = _cell(nodes, x, y)
+    i, j, fx, fy = _cell(nodes, levels, x, y)
     k, t = _level(nodes, levels, w)
     z, _, _, zw = _mixed(nodes, s, i, j, k, 2, fx, fy, t)
     return z, zw / levels[1]
 
 
 @lane
-def _cell(nodes, x, y):
+def _cell(nodes, levels, x, y):
     """Row and column of the node before a pixel, and how far behind it the pixel is."""
-    at_x, at_y = x / _F(NODE_STEP), y / _F(NODE_STEP)
+    at_x, at_y = x / levels[2], y / levels[2]
     j = min(max(int(at_x), 0), nodes.shape[2] - 2)
     i = min(max(int(at_y), 0), nodes.shape[1] - 2)
     return i, j, at_x - _F(j), at_y - _F(i)
