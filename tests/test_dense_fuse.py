@@ -11,7 +11,7 @@ from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.fuse import fuse, noise_px, placed, robust_stddev
 from uwsfm.dense.options import DenseOptions, bytes_of
-from uwsfm.dense.voxels import Fused, Voxels
+from uwsfm.dense.voxels import BYTES_PER_VOXEL, Fused, Voxels
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.residuals import border
@@ -45,7 +45,8 @@ def maps_of_floor(rng: np.random.Generator, num: int, bump: float = 0.0):
             ranges[20:40, 20:40] -= bump
         constant = np.full(shape, SENSITIVITY, dtype=np.float32)
         calibration = np.zeros(shape, dtype=np.float32)
-        found.append(placed(camera, pose, ranges.astype("f4"), constant, calibration))
+        depth = DepthMap(ranges=ranges.astype("f4"), sensitivity=constant)
+        found.append(placed(camera, pose, depth, calibration))
     return found
 
 
@@ -147,10 +148,28 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         assert cloud.stddev[i] == pytest.approx(expected, rel=1e-9)
     with pytest.raises(InputError, match="choose a larger --voxel"):
         Voxels(1e-9, origin, 1e9).add(fused)
-    few = Voxels(0.001, origin, 1e3)
-    few.add(fused)
-    with pytest.raises(InputError, match="do not fit the memory"):
-        few.cloud()
+
+
+def test_voxels_that_do_not_fit_become_larger(rng: np.random.Generator):
+    """Rather than none after all the work; and nothing is lost."""
+    count = 5000
+    points = np.column_stack([rng.uniform(0.0, 1.0, (count, 2)), np.zeros(count)])
+    fused = Fused(
+        points=points,
+        normals=np.tile([0.0, 0.0, -1.0], (count, 1)),
+        colors=np.zeros((count, 3), dtype=np.uint8),
+        stddev=np.full(count, 0.001),
+        num_views=np.full(count, 3),
+        view_range=np.full(count, 1.5),
+    )
+    voxels = Voxels(0.001, np.zeros(3), 300.0 * BYTES_PER_VOXEL)
+    voxels.add(fused)
+    cloud = voxels.cloud()
+    # Half of a surface's voxels remain at each step.
+    assert 120 < len(cloud) <= 300 and voxels.size > 0.05
+    assert np.ptp(cloud.points[:, :2], axis=0).min() > 0.9
+    np.testing.assert_allclose(cloud.stddev, 0.001)
+    np.testing.assert_allclose(cloud.normals, [[0.0, 0.0, -1.0]] * len(cloud))
 
 
 OFF_BY = {

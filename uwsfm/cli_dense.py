@@ -46,6 +46,13 @@ def dense(
             show_default=False,
         ),
     ] = None,
+    quality: Annotated[
+        str,
+        typer.Option(
+            help="high, medium or low: how far one camera's images are reduced; pairs "
+            "are compared as they are."
+        ),
+    ] = "medium",
     max_memory: Annotated[
         str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
     ] = "2GB",
@@ -69,6 +76,7 @@ def dense(
             min_views=min_views,
             keep_single=keep_single,
             noise_px=noise_px,
+            quality=quality,
             max_memory=bytes_of(max_memory),
             num_threads=threads,
         )

@@ -28,6 +28,11 @@ class DepthMap:
     """From the outer surface of the port along the water ray, metres."""
     sensitivity: Plane
     """Change of the range per pixel of disparity, metres."""
+    spread: Plane | None = None
+    """Standard deviation of the disparity, of that of ordinary texture: plain areas are
+    known less well. None: all alike."""
+    normals: NDArray[Any] | None = None
+    """(H, W, 3) of the surface, in the camera, towards it; None: not known."""
 
     @property
     def num_valid(self) -> int:
@@ -59,17 +64,28 @@ def sampled(plane: Plane, at: Plane, *, nearest: bool = False) -> Plane:
 
 def write_depth_map(depth: DepthMap, path: Path, key: str) -> None:
     """Write a depth map with a key that tells what it was made of."""
-    with replaced_file(path) as partial, partial.open("wb") as file:
-        np.savez(
-            file,
-            key=np.array(key),
-            ranges=depth.ranges,
-            sensitivity=depth.sensitivity,
-        )
+    planes = {name: getattr(depth, name) for name in DepthMap.__dataclass_fields__}
+    known = {name: plane for name, plane in planes.items() if plane is not None}
+    write_planes(path, key, known)
 
 
 def read_depth_map(path: Path, key: str) -> DepthMap | None:
-    """Read a depth map; None if it is not there or of another key.
+    """Read a depth map; None if it is not there or of another key."""
+    planes = read_planes(path, key)
+    try:
+        return None if planes is None else DepthMap(**planes)
+    except TypeError:  # of another version
+        return None
+
+
+def write_planes(path: Path, key: str, planes: dict[str, NDArray[Any]]) -> None:
+    """Write arrays by name, with a key that tells what they were made of."""
+    with replaced_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, key=np.array(key), **planes)
+
+
+def read_planes(path: Path, key: str) -> dict[str, NDArray[Any]] | None:
+    """Read arrays; None if they are not there or of another key.
 
     A file that was cut short counts as absent: it is made again.
     """
@@ -77,8 +93,6 @@ def read_depth_map(path: Path, key: str) -> DepthMap | None:
         with np.load(path) as content:
             if str(content["key"]) != key:
                 return None
-            return DepthMap(
-                ranges=content["ranges"], sensitivity=content["sensitivity"]
-            )
+            return {name: content[name] for name in content.files if name != "key"}
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None

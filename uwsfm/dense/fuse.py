@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.dense.depth_map import Plane, pixel_rows, sampled
+from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows, sampled
 from uwsfm.dense.voxels import Fused
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -46,9 +46,12 @@ class Placed:
     distance: Plane
     """(H, W) of the points from the projection centre."""
     sensitivity: Plane
-    """(H, W) metres per pixel of disparity."""
+    """(H, W) metres per pixel of disparity, of ordinary texture: more where a depth is
+    known less well."""
     calibration: Plane
     """(H, W) standard deviation from the calibration, metres; zero if it has none."""
+    normals: NDArray[np.float32] | None = None
+    """(H, W, 3) in the camera, towards it; None: of the points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +128,7 @@ def fuse(
         min_views: depth maps that have to agree, this one included.
         keep_single: whether to keep what no other depth map sees at all.
     """
-    normals = normals_of(view)
+    normals = normals_of(view) if view.normals is None else view.normals
     keep = np.isfinite(view.distance) & np.isfinite(normals[..., 0])
     where = np.flatnonzero(keep)
     parts, totals = [], np.zeros(3, dtype=np.int64)
@@ -274,21 +277,19 @@ def _empty() -> Fused:
 
 
 def placed(
-    camera: RefractiveCamera,
-    cam_from_world: Array,
-    ranges: Plane,
-    sensitivity: Plane,
-    calibration: Plane,
+    camera: RefractiveCamera, cam_from_world: Array, depth: DepthMap, calibration: Plane
 ) -> Placed:
     """A depth map with its points."""
     origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
-    points = origins + ranges.reshape(-1, 1) * dirs
-    shape = ranges.shape
+    points = origins + depth.ranges.reshape(-1, 1) * dirs
+    shape = depth.ranges.shape
+    alike = depth.spread is None
     return Placed(
         camera=camera,
         cam_from_world=cam_from_world,
         points=points.astype(np.float32).reshape(*shape, 3),
         distance=np.linalg.norm(points, axis=1).astype(np.float32).reshape(shape),
-        sensitivity=sensitivity,
+        sensitivity=depth.sensitivity if alike else depth.sensitivity * depth.spread,
         calibration=calibration,
+        normals=depth.normals,
     )

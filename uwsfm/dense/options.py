@@ -11,6 +11,9 @@ from uwsfm.tasks import require_threads
 
 ASSUMED_NOISE_PX = 0.3
 """Of a disparity, where too few depth maps overlap to tell."""
+MAX_PIXELS = {"high": 2.4e6, "medium": 0.6e6, "low": 0.15e6}
+"""That one camera's images are reduced to: half of a GoPro's, a quarter of it each
+way, and so on. Finer than the water is clear, pixels cost time and bring noise."""
 _UNITS = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9}
 
 
@@ -30,6 +33,8 @@ class DenseOptions:
     maps."""
     max_neighbours: int = 8
     """Depth maps that each one is compared with."""
+    quality: str = "medium"
+    """high, medium or low: how far the images of one camera are reduced."""
     max_memory: float = 2e9
     """Bytes that the whole process may use."""
     num_threads: int = -1
@@ -42,6 +47,9 @@ class DenseOptions:
             raise InputError(
                 f"max_neighbours must be at least 1, got {self.max_neighbours}"
             )
+        if self.quality not in MAX_PIXELS:
+            known = ", ".join(MAX_PIXELS)
+            raise InputError(f"--quality must be one of {known}, got {self.quality!r}")
         for name in ("voxel", "noise_px", "max_memory"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:

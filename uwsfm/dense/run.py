@@ -23,17 +23,16 @@ from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
 from uwsfm.dense.maps import DepthMaps
 from uwsfm.dense.options import ASSUMED_NOISE_PX, DenseOptions
-from uwsfm.dense.views import load_image, neighbours
+from uwsfm.dense.plan import PLACED_BYTES, Load, Plan, plan
+from uwsfm.dense.views import neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.summary import write_json
-from uwsfm.job_log import job_log
+from uwsfm.job_log import job_log, logger
 from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
 SUMMARY = "summary.json"
 """Beside the cloud."""
-PLACED_BYTES = 28
-"""Per pixel of a depth map in memory, with its points."""
 _NOISE_VIEWS, _NOISE_NEIGHBOURS = 24, 3
 
 
@@ -101,12 +100,13 @@ class _Run:
     ) -> None:
         self.result, self.images, self.options = result, images, options
         self.model, self.progress = result.model, progress
-        self.maps = DepthMaps(result, images)
+        self.maps = DepthMaps(result, images, options.quality)
         self.views = self.maps.views
         cores = os.cpu_count() or 1
         self.threads = cores if options.num_threads < 1 else options.num_threads
         self.seconds: dict[str, float] = {}
-        self.store = _Store(self.maps.placed, self._depth_budget())
+        self.plan = self._planned()
+        self.store = _Store(self.maps.placed, self.plan.store_bytes)
 
     def __enter__(self) -> _Run:
         # OpenCV's own threads would fight with ours.
@@ -141,10 +141,13 @@ class _Run:
 
     def cloud(self) -> DenseResult:
         self.check()
+        logger.info("%s", self.plan)
         matched = self._timed("depth maps", self._match_all)
         noise, assumed = self._timed("noise", self._noise)
         voxel = self.options.voxel or self._footprint()
-        counts, cloud = self._timed("fusion", lambda: self._fuse_all(noise, voxel))
+        counts, cloud, size = self._timed(
+            "fusion", lambda: self._fuse_all(noise, voxel)
+        )
         if not len(cloud):
             raise UwsfmError(self._why_empty(counts))
         path = self.result.folder / DENSE_CLOUD
@@ -155,7 +158,8 @@ class _Run:
             "model": self.result.fingerprint,
             "num_points": len(cloud),
             "unit": unit,
-            "voxel": voxel,
+            "voxel": size,
+            "voxel_asked": voxel,
             "noise_px": noise,
             "noise_from": "assumed" if assumed else "differences between depth maps",
             "calibration_stddev_max": self._calibration_summary(),
@@ -168,6 +172,7 @@ class _Run:
             },
             **counts,
             "options": asdict(self.options),
+            "plan": asdict(self.plan),
             "seconds": self.seconds,
         }
         write_json(summary, path.with_name(SUMMARY))
@@ -199,51 +204,42 @@ class _Run:
 
     def _match_all(self) -> list[dict[str, Any]]:
         """Make every depth map that is not there; what is known of each."""
-        workers = max(1, min(self.threads, len(self.views)))
-        budget = self._budget_of(workers)
-        while workers > 1 and budget is None:
-            workers -= 1
-            budget = self._budget_of(workers)
-        if budget is None:
-            raise InputError(
-                f"--max-memory {self.options.max_memory / 1e9:.2f}GB is too little for "
-                f"images of this size: they need {self._needed() / 1e9:.2f}GB"
-            )
-        entries: list[dict[str, Any]] = [{} for _ in self.views]
-        self.progress("depth maps", 0, len(self.views))
-        with ThreadPoolExecutor(workers) as pool:
-            jobs = {
-                pool.submit(self.maps.make, index, budget): index
-                for index in range(len(self.views))
-            }
+        passes: list[tuple[str, Callable[[int], Any]]] = []
+        if self.maps.num_passes > 1:
+            passes.append(("first depths", self.maps.search))
+        budget = self.plan.match_bytes
+        passes.append(("depth maps", lambda index: self.maps.make(index, budget)))
+        for step, action in passes:
+            entries = self._of_all_views(step, action)
+        return entries
+
+    def _of_all_views(self, step: str, action: Callable[[int], Any]) -> list[Any]:
+        found: list[Any] = [None for _ in self.views]
+        self.progress(step, 0, len(self.views))
+        with ThreadPoolExecutor(self.plan.matchers) as pool:
+            jobs = {pool.submit(action, index): index for index in range(len(found))}
             try:
                 for done, job in enumerate(as_completed(jobs), 1):
-                    entries[jobs[job]] = job.result()
-                    self.progress("depth maps", done, len(self.views))
+                    found[jobs[job]] = job.result()
+                    self.progress(step, done, len(self.views))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-        return entries
+        return found
 
-    # Memory.
-
-    def _depth_budget(self) -> float:
-        """Bytes for depth maps and voxels, beyond what the process has already."""
+    def _planned(self) -> Plan:
         import psutil
 
-        return self.options.max_memory - psutil.Process().memory_info().rss
-
-    def _needed(self) -> float:
-        """Bytes of the process while one depth map is made, at least."""
-        used = self.options.max_memory - self._depth_budget()
-        largest = {v.key: i for i, v in enumerate(self.views)}
-        return used + max(self.maps.bytes_of(index) for index in largest.values())
-
-    def _budget_of(self, workers: int) -> float | None:
-        """Bytes for each worker; None if they are too few."""
-        used = self.options.max_memory - self._depth_budget()
-        each = (self.options.max_memory - used) / workers
-        return each if used + each >= self._needed() else None
+        cameras = [self.maps.camera(view) for view in self.views]
+        largest = {view.key: index for index, view in enumerate(self.views)}
+        load = Load(
+            pixels=[camera.width * camera.height for camera in cameras],
+            map_bytes=max(self.maps.bytes_of(index) for index in largest.values()),
+            is_stereo=self.views[0].is_stereo,
+            neighbours=self.options.max_neighbours,
+        )
+        used = float(psutil.Process().memory_info().rss)
+        return plan(load, self.options.max_memory, used, self.threads)
 
     # Fusion.
 
@@ -282,34 +278,38 @@ class _Run:
             raise UwsfmError("nothing was matched in any image: is the water clear?")
         return float(np.median(found))
 
-    def _fuse_all(self, noise: float, voxel: float) -> tuple[dict[str, Any], Cloud]:
+    def _fuse_all(
+        self, noise: float, voxel: float
+    ) -> tuple[dict[str, Any], Cloud, float]:
+        """Counts, the cloud, and the voxels' size."""
         scene = self.model.scene
         middle = np.nanmedian(scene.points, axis=0)
-        voxels = Voxels(voxel, middle, self._depth_budget() - self.store.max_bytes)
+        voxels = Voxels(voxel, middle, self.plan.voxel_bytes)
         totals = np.zeros(4, dtype=np.int64)
-        count = len(self.views)
-        with ThreadPoolExecutor(self.threads) as pool:
+        count, ahead = len(self.views), self.plan.fusers
+        with ThreadPoolExecutor(ahead) as pool:
             # In order, so that runs repeat to the last digit; a few ahead, since what
             # is finished waits in memory.
             jobs: deque[Future] = deque()
-            for index in range(count + self.threads):
+            for index in range(count + ahead):
                 if index < count:
                     jobs.append(pool.submit(self._fuse_one, index, noise))
-                if index < self.threads:
+                if index < ahead:
                     continue
                 fused, counts = jobs.popleft().result()
                 voxels.add(fused)
                 totals += list(asdict(counts).values())
-                self.progress("fusion", index + 1 - self.threads, count)
+                self.progress("fusion", index + 1 - ahead, count)
         names = ("num_measured", "num_confirmed", "num_contradicted", "num_unchecked")
-        return dict(zip(names, totals.tolist(), strict=True)), voxels.cloud()
+        self.store.clear()
+        cloud = voxels.cloud()
+        return dict(zip(names, totals.tolist(), strict=True)), cloud, voxels.size
 
     def _fuse_one(self, index: int, noise: float) -> tuple[Fused, FuseCounts]:
-        view = self.views[index]
         return fuse(
             self.store.get(index),
             [self.store.get(i) for i in self.near[index]],
-            load_image(self.model, self.images, view.camera, view.name),
+            self.maps.color(index),
             noise,
             min_views=self.options.min_views,
             keep_single=self.options.keep_single,
@@ -319,9 +319,8 @@ class _Run:
 class _Store:
     """Placed depth maps, the last used ones kept."""
 
-    def __init__(self, load: Callable[[int], Placed], budget: float) -> None:
-        self._load = load
-        self.max_bytes = 0.5 * budget
+    def __init__(self, load: Callable[[int], Placed], max_bytes: float) -> None:
+        self._load, self._max_bytes = load, max_bytes
         self._kept: OrderedDict[int, Placed] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -333,10 +332,14 @@ class _Store:
         found = self._load(index)
         with self._lock:
             self._kept[index] = found
-            room = self.max_bytes / (PLACED_BYTES * found.distance.size)
+            room = self._max_bytes / (PLACED_BYTES * found.distance.size)
             while len(self._kept) > max(1, room):
                 self._kept.popitem(last=False)
         return found
+
+    def clear(self) -> None:
+        with self._lock:
+            self._kept.clear()
 
 
 def _percentiles(values: Any) -> dict[str, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from uwsfm.colmap import Model
 from uwsfm.dense.rectify import Pair, Rectification, rectifications
@@ -18,10 +18,13 @@ from uwsfm.sfm.pixels import read_color, size_fault
 
 MIN_POINTS = 10
 """Of a frame, to know its depths from; with fewer those of all frames serve."""
-NUM_SOURCES = 4
-"""Neighbouring frames that one camera's image is swept with."""
-MIN_PARALLAX, GOOD_PARALLAX = 0.03, 0.12
-"""Distance between frames over that of the scene."""
+NUM_SOURCES = 6
+"""Neighbouring frames that one camera's image is compared with."""
+MIN_PARALLAX, GOOD_PARALLAX, MAX_PARALLAX = 0.03, 0.12, 0.8
+"""Angles between the sights of a point: too little for its depth, enough, and so much
+that it looks like another."""
+MAX_CANDIDATES = 60
+"""Frames that share most points, among which neighbours are chosen."""
 DEPTH_PERCENTILES = (1.0, 99.0)
 DEPTH_MARGIN = 0.15
 """Of the inverse depths, on both sides: the scene goes on between its points."""
@@ -106,15 +109,14 @@ def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
     return views, refused
 
 
-def sweep_views(model: Model) -> list[View]:
+def mono_views(model: Model) -> list[View]:
     """Depth maps of one camera's images from its neighbouring frames.
 
     Raises:
         InputError: no frame has two neighbours that see the same from elsewhere.
     """
     scene = model.scene
-    shared = _shared_points(scene)
-    world_from_rig = rigid3.inverse(scene.rig_from_world)
+    seen = _seen_points(scene)
     depths = scene.points_in_cam()[:, 2]
     views = []
     for camera in range(len(scene.cameras)):
@@ -125,13 +127,7 @@ def sweep_views(model: Model) -> list[View]:
             own = depths[rows & np.isfinite(depths)]
             if len(own) < MIN_POINTS:
                 continue
-            moved = world_from_rig[:, 4:] - world_from_rig[frame, 4:]
-            angle = np.linalg.norm(moved, axis=1) / np.median(own)
-            counts = shared[[frame]].toarray()[0]
-            # More points and, up to a limit, more parallax; never a turn on the spot.
-            worth = counts * np.minimum(angle / GOOD_PARALLAX, 1.0)
-            worth[(angle < MIN_PARALLAX) | (counts < MIN_POINTS)] = 0.0
-            best = [int(f) for f in np.argsort(-worth, kind="stable") if worth[f] > 0.0]
+            best = _partners(scene, seen, frame)
             chosen = [f for f in best if model.has_image(camera, f)][:NUM_SOURCES]
             if len(chosen) < 2:
                 continue
@@ -153,6 +149,46 @@ def sweep_views(model: Model) -> list[View]:
             "neighbouring frames that see the same points from elsewhere"
         )
     return views
+
+
+def _partners(scene: Scene, seen: csr_array, frame: int) -> list[int]:
+    """Frames to compare one with, the most useful first.
+
+    Each adds points with parallax, and those that others have seen already count less:
+    so all of the image is seen by some.
+    """
+    points = seen[[frame]].indices
+    points = points[np.isfinite(scene.points[points]).all(axis=1)]
+    shared = seen[:, points]
+    counts = np.asarray(shared.sum(axis=1)).ravel()
+    counts[frame] = 0.0
+    candidates = np.argsort(-counts, kind="stable")[:MAX_CANDIDATES]
+    candidates = candidates[counts[candidates] >= MIN_POINTS]
+    if not len(candidates):
+        return []
+    centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
+
+    def sights(f: int) -> Array:
+        sight = scene.points[points] - centers[f]
+        return sight / np.linalg.norm(sight, axis=1, keepdims=True)
+
+    own = sights(frame)
+    worth = shared[candidates].toarray()
+    for row, f in zip(worth, candidates, strict=True):
+        angle = np.arccos(np.clip(np.sum(own * sights(int(f)), axis=1), -1.0, 1.0))
+        row *= np.clip(angle / GOOD_PARALLAX, 0.0, 1.0) * (angle > MIN_PARALLAX)
+        row *= np.clip((MAX_PARALLAX - angle) / (0.5 * MAX_PARALLAX), 0.05, 1.0)
+    needed = np.ones(len(points))
+    found: list[int] = []
+    for _ in range(min(len(candidates), 2 * NUM_SOURCES)):
+        gains = worth @ needed
+        best = int(np.argmax(gains))
+        if gains[best] < 1.0:
+            break
+        found.append(int(candidates[best]))
+        needed *= 1.0 - 0.5 * np.clip(worth[best], 0.0, 1.0)
+        worth[best] = 0.0
+    return found
 
 
 def pair_of(model: Model, left: int, right: int, near: float, far: float) -> Pair:
@@ -202,11 +238,17 @@ def neighbours(model: Model, views: list[View], limit: int) -> list[list[int]]:
     return found
 
 
-def _shared_points(scene: Scene):
-    """How many points two frames share, (F, F) sparse."""
+def _seen_points(scene: Scene) -> csr_array:
+    """Which points frames see, (F, N)."""
     shape = scene.num_frames, scene.num_points
     pairs = np.unique(np.stack([scene.frame_idx, scene.point_idx], axis=1), axis=0)
-    seen = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape).tocsr()
+    ones = np.ones(len(pairs))
+    return coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape).tocsr()
+
+
+def _shared_points(scene: Scene) -> csr_array:
+    """How many points two frames share, (F, F)."""
+    seen = _seen_points(scene)
     return (seen @ seen.T).tocsr()
 
 

@@ -1,8 +1,10 @@
 """One point per voxel: inverse-variance means that keep double precision.
 
 A hash of voxels in numpy: points are sorted by voxel and summed, new ones are merged
-with what is there. A voxel is about a pixel's footprint, and its points come from maps
-that were fused before: it thins out, the noise was averaged along the lines of sight.
+with what is there, one part of the voxels at a time. A voxel is about a pixel's
+footprint, and its points come from maps that were fused before: it thins out, the noise
+was averaged along the lines of sight. Voxels that would not fit the memory become
+larger ones: a cloud that is coarser than asked for is better than none.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
-BYTES_PER_VOXEL = 250
-"""While voxels are merged (measured)."""
+BYTES_PER_VOXEL = 190
+"""Where all become a cloud and its file (measured)."""
+COARSER = 2.0**0.5
+"""Of a side, so that half of the voxels of a surface remain."""
 _BITS = 21
+_PARTS = 16
 _PENDING = 1_000_000
 
 
@@ -47,28 +52,23 @@ class Voxels:
     """
 
     def __init__(self, size: float, origin: Array, max_bytes: float) -> None:
-        self._size, self._origin, self._max_bytes = size, origin, max_bytes
+        self.size = size
+        """Of a side, metres: larger than asked for if that did not fit."""
+        self._origin, self._max_bytes = origin, max_bytes
         self._pending: list[np.ndarray] = []
-        self._rows = np.empty(0, dtype=_ROW)
+        self._parts = [np.empty(0, dtype=_ROW) for _ in range(_PARTS)]
 
     def add(self, fused: Fused) -> None:
         """Add points.
 
         Raises:
-            InputError: the voxels need more memory than allowed.
+            InputError: they are too far apart for voxels of this size.
         """
         if not len(fused):
             return
         local = fused.points - self._origin
-        cell = np.floor(local / self._size).astype(np.int64) + (1 << (_BITS - 1))
-        inside = np.all((cell >= 0) & (cell < 1 << _BITS), axis=1)
-        if not inside.all():
-            raise InputError(
-                f"the cloud spans more than {1 << _BITS} voxels of {self._size:g}: "
-                "choose a larger --voxel"
-            )
         rows = np.zeros(len(fused), dtype=_ROW)
-        rows["key"] = (cell[:, 0] << (2 * _BITS)) | (cell[:, 1] << _BITS) | cell[:, 2]
+        rows["key"] = self._keys(local)
         weight = fused.stddev**-2.0
         rows["weight"] = weight
         rows["position"] = weight[:, None] * local
@@ -80,34 +80,59 @@ class Voxels:
         if sum(map(len, self._pending)) > _PENDING:
             self._flush()
 
-    def _flush(self) -> None:
-        rows = np.concatenate([self._rows, *self._pending])
-        self._pending = []
-        self._rows = _merged(rows)
-        if len(self._rows) * BYTES_PER_VOXEL > self._max_bytes:
+    def _keys(self, local: Array) -> NDArray[np.int64]:
+        cell = np.floor(local / self.size).astype(np.int64) + (1 << (_BITS - 1))
+        inside = np.all((cell >= 0) & (cell < 1 << _BITS), axis=1)
+        if not inside.all():
             raise InputError(
-                f"{len(self._rows)} voxels of {self._size:g} do not fit the memory "
-                f"left of --max-memory ({self._max_bytes / 1e9:.1f} GB): choose a "
-                "larger --voxel"
+                f"the cloud spans more than {1 << _BITS} voxels of {self.size:g}: "
+                "choose a larger --voxel"
             )
+        return (cell[:, 0] << (2 * _BITS)) | (cell[:, 1] << _BITS) | cell[:, 2]
+
+    def __len__(self) -> int:
+        return sum(map(len, self._parts))
+
+    def _flush(self) -> None:
+        pending, self._pending = self._pending, []
+        if pending:
+            self._merge(np.concatenate(pending))
+        while len(self) * BYTES_PER_VOXEL > self._max_bytes and len(self) > _PARTS:
+            self._coarsen()
+
+    def _merge(self, rows: np.ndarray) -> None:
+        part = rows["key"] % _PARTS
+        for index in range(_PARTS):
+            both = [self._parts[index], rows[part == index]]
+            self._parts[index] = _merged(np.concatenate(both))
+
+    def _coarsen(self) -> None:
+        self.size *= COARSER
+        parts, self._parts = self._parts, [np.empty(0, dtype=_ROW)] * _PARTS
+        while parts:
+            rows = parts.pop()
+            rows["key"] = self._keys(rows["position"] / rows["weight"][:, None])
+            self._merge(rows)
 
     def cloud(self) -> Cloud:
-        """The mean point of each voxel."""
+        """The mean point of each voxel; they are given up as it is made."""
         self._flush()
-        rows = self._rows
-        weight = rows["weight"][:, None]
-        normals = rows["normal"].astype(np.float64)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            normals = np.where(length > 0.0, normals / length, np.nan)
-        return Cloud(
-            points=rows["position"] / weight + self._origin,
-            normals=normals,
-            colors=rows["colors"],
-            stddev=rows["stddev"] / rows["weight"],
-            num_views=rows["num_views"].astype(np.int64),
-            view_range=rows["view_range"].astype(np.float64),
-        )
+        count, first = len(self), 0
+        cloud = _room_for(count)
+        while self._parts:
+            rows = self._parts.pop(0)
+            to = slice(first, first + len(rows))
+            first += len(rows)
+            weight = rows["weight"][:, None]
+            normals = rows["normal"].astype(np.float64)
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                cloud.normals[to] = np.where(length > 0.0, normals / length, np.nan)
+            cloud.points[to] = rows["position"] / weight + self._origin
+            cloud.stddev[to] = rows["stddev"] / rows["weight"]
+            for name in ("colors", "num_views", "view_range"):
+                getattr(cloud, name)[to] = rows[name]
+        return cloud
 
 
 _ROW = np.dtype(
@@ -115,13 +140,24 @@ _ROW = np.dtype(
         ("key", "<i8"),
         ("weight", "<f8"),
         ("position", "<f8", 3),
-        ("normal", "<f8", 3),
+        ("normal", "<f4", 3),
         ("stddev", "<f8"),
         ("colors", "u1", 3),
         ("num_views", "<i4"),
         ("view_range", "<f4"),
     ]
 )
+
+
+def _room_for(count: int) -> Cloud:
+    return Cloud(
+        points=np.empty((count, 3)),
+        normals=np.empty((count, 3)),
+        colors=np.empty((count, 3), dtype=np.uint8),
+        stddev=np.empty(count),
+        num_views=np.empty(count, dtype=np.int64),
+        view_range=np.empty(count),
+    )
 
 
 def _merged(rows: np.ndarray) -> np.ndarray:
