@@ -61,7 +61,7 @@ def test_comments_are_the_deviations_from_the_images_and_in_all(
     assert total == pytest.approx([7e-5, 1.25e-4, 1.8e-4], abs=5.1e-7)
     found = re.fullmatch(
         rf"rotation: standard deviation ({NUMBER}) deg from the images, ({NUMBER}) in "
-        "all",
+        "all, of the whole angle; rotation_deg below is per axis",
         line_of(path, "rotation"),
     )
     assert [float(v) for v in found.groups()] == pytest.approx([0.0652, 0.0815])

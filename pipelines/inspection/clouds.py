@@ -203,14 +203,21 @@ def colmap_centers(folder: Path) -> dict[str, Array]:
     return found
 
 
-def results(out: Path) -> Iterator[tuple[str, SequenceSpec, Path, Path]]:
-    """Name, truth, result folder and images of each scene, made where missing."""
+def results(out: Path, only: str) -> Iterator[tuple[str, SequenceSpec, Path, Path]]:
+    """Name, truth, result folder and images of scenes, made where missing.
+
+    Args:
+        out: their folder.
+        only: what their names must hold.
+    """
     for name, make in SPECS.items():
         spec, folder = make(), out / name
         if not folder.exists():
             with ProgressBars() as progress:
                 render_sequence(spec, folder, progress)
         for suffix in ("", f" {ONE}"):
+            if only not in f"{name}{suffix}":
+                continue
             result = out / f"{name}_{suffix.strip() or 'out'}"
             rig = folder / "rig.yaml"
             if suffix:
@@ -241,9 +248,7 @@ def main() -> None:
     head = [f"accuracy | completeness | F1 at {t:g} mm" for t in TOLERANCES_MM]
     print(f"| scene | cloud of | points | {' | '.join(head)} |")
     print("|---" * (3 + 3 * len(TOLERANCES_MM)) + "|")
-    for name, spec, result, images in results(options.out):
-        if options.only not in name:
-            continue
+    for name, spec, result, images in results(options.out, options.only):
         surface = surface_of(spec, 1 if name.endswith(ONE) else 2)
         cloud = dense(result, images)
         points = placed(cloud.points, model_centers(uwsfm.read_model(result)), spec)

@@ -81,7 +81,8 @@ def read_depth_map(path: Path, key: str) -> DepthMap | None:
 def write_planes(path: Path, key: str, planes: dict[str, NDArray[Any]]) -> None:
     """Write arrays by name, with a key that tells what they were made of."""
     with replaced_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, key=np.array(key), **planes)
+        arrays: dict[str, Any] = {"key": np.array(key), **planes}
+        np.savez(file, **arrays)
 
 
 def read_planes(path: Path, key: str) -> dict[str, NDArray[Any]] | None:

@@ -207,13 +207,13 @@ def depth_map_of(
         sensitivity = depth * depth / (steps * moves)
         sensitivity[~known] = np.nan
         # Along the surface: points are feet + slopes / w.
-        tangents = [
+        right, down = (
             np.gradient(feet, axis=axis)
             + np.gradient(slopes, axis=axis) * depth[..., None]
             - slopes * (planes[..., part] * depth * depth)[..., None]
             for axis, part in ((1, 1), (0, 2))
-        ]
-        normals = -np.cross(*tangents)
+        )
+        normals = -np.cross(right, down)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     normals[~known] = np.nan
     return DepthMap(

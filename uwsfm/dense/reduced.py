@@ -42,5 +42,5 @@ def for_scale(image: NDArray[Any], scale: int) -> NDArray[Any]:
         return plane
     height, width = (-(-n // scale) for n in image.shape)
     pad = height * scale - image.shape[0], width * scale - image.shape[1]
-    plane = cv2.copyMakeBorder(plane, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
-    return cv2.resize(plane, (width, height), interpolation=cv2.INTER_AREA)
+    filled = cv2.copyMakeBorder(plane, 0, pad[0], 0, pad[1], cv2.BORDER_REPLICATE)
+    return cv2.resize(filled, (width, height), interpolation=cv2.INTER_AREA)
