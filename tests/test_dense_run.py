@@ -18,6 +18,7 @@ from uwsfm.dense import maps
 from uwsfm.dense.depth_map import DepthMap
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import WORK
+from uwsfm.job_log import LOG
 from uwsfm.residuals import border
 
 
@@ -54,6 +55,9 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     summary = json.loads((dive.out / "dense" / "summary.json").read_text())
     assert summary["num_points"] == len(cloud) > 20_000
     assert summary["unit"] == "metre"
+    # What it will take is told before the first image.
+    steps = (dive.out / LOG).read_text().split("depth maps\n")[-2].splitlines()
+    assert f"plan: {summary['plan']['num_maps']} depth map" in steps[-2]
     assert summary["noise_from"] == "differences between depth maps"
     assert summary["calibration_stddev_max"]["0-1"] > 0.0
     middle = cloud.points.mean(axis=0)

@@ -52,7 +52,7 @@ MIN_CORRELATION = 0.3
 MIN_AGREEING = 2
 """Neighbours that have the surface there, too: of what is plain, these decide."""
 BYTES_PER_PIXEL, BYTES_PER_NEIGHBOUR = 500, 20
-"""In all passes (measured), beside the warp's table."""
+"""In all passes, about, beside the warp's table."""
 SLOPE_PER_PX = 0.3
 """Tangent by which chance tilts a hypothesis, per pixel of `reach_px`."""
 

@@ -14,12 +14,12 @@ from uwsfm.errors import InputError
 PLACED_BYTES = 40
 """Per pixel of a depth map in memory, with its points and normals."""
 FUSE_BYTES = 450
-"""Per pixel while its map is fused, beside the maps it is compared with (measured)."""
+"""Per pixel while its map is fused, beside the maps it is compared with, about."""
 STORE_SHARE, FUSE_SHARE = 0.25, 0.25
 """Of the memory, for depth maps that are kept and for those being fused; the rest is
 for voxels."""
 MONO_SECONDS, STEREO_SECONDS, FUSE_SECONDS = 26.0, 4.0, 6.0
-"""Of one core, per megapixel of a depth map (measured)."""
+"""Of one core, per megapixel of a depth map, about: what is told before it begins."""
 
 
 @dataclass(frozen=True, kw_only=True)

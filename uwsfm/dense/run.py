@@ -28,7 +28,7 @@ from uwsfm.dense.views import neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.summary import write_json
-from uwsfm.job_log import job_log, logger
+from uwsfm.job_log import job_log
 from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
 SUMMARY = "summary.json"
@@ -141,7 +141,7 @@ class _Run:
 
     def cloud(self) -> DenseResult:
         self.check()
-        logger.info("%s", self.plan)
+        self.progress(f"plan: {self.plan}", 0, None)
         matched = self._timed("depth maps", self._match_all)
         noise, assumed = self._timed("noise", self._noise)
         voxel = self.options.voxel or self._footprint()

@@ -19,7 +19,7 @@ from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
 BYTES_PER_VOXEL = 190
-"""Where all become a cloud and its file (measured)."""
+"""Where all become a cloud and its file, about."""
 COARSER = 2.0**0.5
 """Of a side, so that half of the voxels of a surface remain."""
 _BITS = 21
