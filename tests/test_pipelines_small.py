@@ -251,6 +251,15 @@ study.HERE, plots.FRAME = Path({str(tmp_path)!r}), 1
     ]
 
 
+def test_inspection_of_whole_clouds(tmp_path):
+    """Of a stereo rig, and of its left camera alone."""
+    change = f"{REEF}\nstudy.SPECS = {{'reef': lambda: spec}}"
+    rows = table(run("inspection/clouds.py", "-o", tmp_path, change=change), "scene")
+    assert [row[0] for row in rows] == ["reef", "reef one"]
+    for row in rows:
+        assert 0.0 < number(row[3]) <= 100.0 and number(row[-2]) > 5.0
+
+
 @pytest.fixture(scope="module")
 def few_photographs(tmp_path_factory):
     """A folder with twelve of the coral's photographs, as `DATA` has all."""
@@ -265,6 +274,15 @@ def few_photographs(tmp_path_factory):
 def test_coral(few_photographs, tmp_path):
     text = run("coral_tg5/pipeline.py", few_photographs, "-o", tmp_path)
     assert re.search(r"refractive: 1[0-2] images", text)
+    (out,) = (path.parent for path in tmp_path.rglob("points.ply"))
+    uwsfm.dense_cloud(out, quality="low")
+    views = [path.stem for path in sorted(few_photographs.iterdir())[:2]]
+    rows = table(
+        run("coral_tg5/dense.py", out, change=f"study.VIEWS = {views}"), "photograph"
+    )
+    assert [row[0] for row in rows] == views
+    assert all(number(row[1]) > 5.0 for row in rows)  # of a quarter of the pixels
+    assert (out / "dense.jpg").stat().st_size > 10_000
 
 
 @needs_data

@@ -245,19 +245,21 @@ def main() -> None:
         metavar=("NAME", "SCENE", "CLOUD", "SPARSE"),
     )
     options = parser.parse_args()
-    head = [f"accuracy | completeness | F1 at {t:g} mm" for t in TOLERANCES_MM]
-    print(f"| scene | cloud of | points | {' | '.join(head)} |")
-    print("|---" * (3 + 3 * len(TOLERANCES_MM)) + "|")
+    rows = []
     for name, spec, result, images in results(options.out, options.only):
         surface = surface_of(spec, 1 if name.endswith(ONE) else 2)
         cloud = dense(result, images)
         points = placed(cloud.points, model_centers(uwsfm.read_model(result)), spec)
-        print(scored(points, surface).row(name, "uwsfm dense"), flush=True)
+        rows.append(scored(points, surface).row(name, "uwsfm dense"))
         for label, scene, path, sparse in options.also:
             if scene == name:
                 other = uwsfm.read_cloud(path).points
                 points = placed(other, colmap_centers(Path(sparse)), spec)
-                print(scored(points, surface).row(name, label), flush=True)
+                rows.append(scored(points, surface).row(name, label))
+    head = [f"accuracy | completeness | F1 at {t:g} mm" for t in TOLERANCES_MM]
+    print(f"| scene | cloud of | points | {' | '.join(head)} |")
+    print("|---" * (3 + 3 * len(TOLERANCES_MM)) + "|")
+    print("\n".join(rows))
 
 
 if __name__ == "__main__":
