@@ -42,6 +42,7 @@ def test_a_result_that_fits_has_no_explanation(out):
     lines = (out / LOG).read_text().splitlines()
     (begin,) = [k for k, line in enumerate(lines) if f"uwsfm check {out}" in line]
     log = "\n".join(lines[begin:])
+    assert "INFO no mistake explains the images better" in log
     assert "INFO looking for the cause" in log and "INFO verdict: fits" in log
 
 

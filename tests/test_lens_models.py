@@ -18,6 +18,7 @@ from uwsfm.models.lens import (
     with_limit,
 )
 from uwsfm.residuals import border
+from uwsfm.rig import camera_from_colmap
 from uwsfm.sfm.lens_mistakes import lens_corrections
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.trust.central import fit_central, fit_lens
@@ -93,3 +94,13 @@ def test_another_kind_of_lens_is_no_brown_lens():
     row[KIND] = 9.0
     with pytest.raises(InputError, match="9 is no kind of lens"):
         with_limit(row)
+
+
+def test_a_number_that_moves_nothing_is_known():
+    """EUCM with alpha zero is a pinhole, whatever its beta."""
+    rig = sample_rig()
+    lens = camera_from_colmap("EUCM", 800, 600, [600.0, 600.0, 400.0, 300.0, 0.0, 1.0])
+    cameras = tuple(replace(camera, camera=lens) for camera in rig.cameras)
+    rig = replace(rig, cameras=cameras, accuracy=RigAccuracy())
+    alpha, beta = rig.given_accuracy().stddevs[0, border.FIRST_LENS + 4 :][:2]
+    assert alpha > 0.0 and beta == 0.0

@@ -8,7 +8,7 @@ from typing import Any
 
 from uwsfm._progress import Progress, silent
 from uwsfm.export.summary import write_json
-from uwsfm.job_log import job_log
+from uwsfm.job_log import job_log, logger
 from uwsfm.result_folder import given_rig, open_result
 from uwsfm.trust.diagnosis import diagnose, options_of
 from uwsfm.trust.explanation import Explanation, of_few_observations
@@ -65,5 +65,7 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
             verdict=summary.get("verdict"), reasons=reasons, explanations=causes
         )
         write_json(found.to_json(), result.folder / CHECK)
+        if not causes:
+            logger.info("no mistake explains the images better than the rig as given")
         log.result(found.to_json())
     return found

@@ -72,6 +72,8 @@ def export(
         )
     if to in ("las", "laz"):
         _export_las(model, out, to)
+        if model.is_dir():
+            _note_verdict(model)
         return
     if model.is_file():
         raise InputError(f"{model} is a file: only --to las and laz take a PLY")

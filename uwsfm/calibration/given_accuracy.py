@@ -255,7 +255,9 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
     radial = {slot for chain in _radial(camera) for slot in chain}
     for k, slot in enumerate(coefficients):
         reach = _corner_shift(camera, slot)
-        default = CORNER / reach if slot in radial else TANGENTIAL
+        # A number that moves nothing, as beta of EUCM with alpha zero, is known.
+        radially = CORNER / reach if reach > 0.0 else 0.0
+        default = radially if slot in radial else TANGENTIAL
         value = None if given is None else given[k]
         moved = (value or 0.0) * reach
         if moved > MAX_CORNER:

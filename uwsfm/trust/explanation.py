@@ -196,7 +196,7 @@ def _port_evidence(base: Tried, one: Tried) -> list[str]:
     ]
     if not before or base.strain < 1.0:
         return []
-    text = f"in this test of a sample, ports at {_millimetres(before)}"
+    text = f"while in this test, of a sample, ports at {_millimetres(before)}"
     if after and np.allclose(before, after, rtol=0.1, atol=1e-3):
         return []
     if after:

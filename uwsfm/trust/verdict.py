@@ -284,7 +284,7 @@ def _freed_text(freed: Freed, words: FreedWords, floor: NoiseFloor | None) -> st
     return text + (
         f"but a noise of {freed.sigma_px:.2g} px is left, where matches of pairs of "
         f"images alone have {floor.floor_px:.2g} px: more than the {words.alone} may "
-        "be wrong, or it is so far off that freeing it does not find the way back."
+        "be wrong, or the way back from there is too long for this test."
     )
 
 
