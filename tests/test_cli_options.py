@@ -78,7 +78,7 @@ COMMANDS = {
     ),
     "dense": (
         "out --images photos --voxel 0.002 --min-views 3 --keep-single --noise-px 0.7 "
-        "--max-memory 5GB --threads 4",
+        "--max-memory 5GB --threads 4 --quality low",
         "uwsfm.dense.run dense_cloud",
         (Path("out"), Path("photos")),
         {
@@ -88,6 +88,7 @@ COMMANDS = {
             "noise_px": 0.7,
             "max_memory": 5 * 10**9,
             "num_threads": 4,
+            "quality": "low",
         },
     ),
     "measure": (

@@ -295,7 +295,7 @@ def test_what_was_made_is_told_with_its_numbers_or_as_another_model_s(
     with (out / "housing.yaml").open("a") as file:
         file.write("# another\n")
     told = dict(left_files(out, "report", "mm", 1e3))
-    assert len(told) == 5  # with ortho.tif and good.ply
+    assert len(told) == 6  # with ortho.tif, origin.tif and good.ply
     assert all("but of another model: make it again" in what for what in told.values())
     with pytest.raises(InputError, match=r"good\.ply is of another model"):
         uwsfm.make_map(out / "good.ply", tmp_path / "again", up="z")

@@ -35,9 +35,20 @@ DISTORTIONS = {
     "RADIAL": [-0.05, 0.018],
     "OPENCV": [-0.05, 0.018, 2e-4, -1e-4],
     "FULL_OPENCV": [-0.05, 0.018, 2e-4, -1e-4, 0.002, 0.01, -0.004, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [-0.02],
+    "RADIAL_FISHEYE": [-0.02, 0.006],
     "OPENCV_FISHEYE": [-0.02, 0.006, -0.002, 0.0005],
+    "THIN_PRISM_FISHEYE": [-0.02, 0.006, 2e-4, -1e-4, -0.002, 0.0005, 1e-4, -1e-4],
+    "FOV": [0.6],
+    "EUCM": [0.55, 1.05],
 }
-ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+ONE_FOCAL = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+)
 STAGES = (
     "unproject",
     "project",

@@ -19,15 +19,6 @@ from uwsfm.calibration.named_covariance import (
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.lens import (
-    ANGLE_KINDS,
-    BROWN,
-    KIND,
-    NUM_PARAMS,
-    PINHOLE,
-    dir_from_img,
-    jac_by_params,
-)
 from uwsfm.residuals import border
 
 FOCAL = 1e-3
@@ -76,6 +67,9 @@ _SHAPE = ({4: 0}, {5: 0})
 
 
 def _radial(camera: "GivenCamera") -> tuple[dict[int, int], ...]:
+    # It compiles kernels, and a rig file is read without them.
+    from uwsfm.models.lens import ANGLE_KINDS, BROWN, KIND, PINHOLE
+
     if camera.lens[KIND] in ANGLE_KINDS:
         return _FISHEYE
     return _BROWN if camera.lens[KIND] in (PINHOLE, BROWN) else _SHAPE
@@ -281,6 +275,8 @@ def _corner_shift(camera: GivenCamera, slot: int) -> float:
 
 def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
     """The same of a lens whose numbers are no coefficients, by its derivative."""
+    from uwsfm.models.lens import NUM_PARAMS, dir_from_img, jac_by_params
+
     corner = float(np.hypot(*size_px)) / 2.0
     x, _, z = dir_from_img(lens[2] + corner, lens[3], lens)
     if not z > 0.0:  # as far as it sees

@@ -48,7 +48,8 @@ def read_model(folder: str | Path) -> Model:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    if not (folder / SPARSE).is_dir() and (folder / WORK).is_dir():
+    made = (folder / SPARSE).is_dir() or (folder / SUMMARY).is_file()
+    if not made and (folder / WORK).is_dir():
         raise InputError(
             f"{folder} holds no result yet: its run was stopped; give the same command "
             "again, which goes on"
