@@ -9,6 +9,8 @@ from hand_made_result import small_model
 
 from uwsfm.errors import InputError
 from uwsfm.export.files import (
+    SUMMARY,
+    WORK,
     depth_stddev,
     export_colmap,
     export_ply,
@@ -208,3 +210,16 @@ def test_a_map_declares_its_scale_place_and_unit(height_map, tmp_path, unit, wri
     else:
         assert pixels.shape == (2, 3, 4) and list(pixels[0, 1]) == [10, 20, 30, 255]
         assert tags[338] == (2,)  # alpha that colours were not multiplied by
+
+
+def test_a_run_that_was_stopped_is_told_from_a_result_that_lost_its_model(tmp_path):
+    (tmp_path / WORK).mkdir()
+    with pytest.raises(InputError, match="no result yet: its run was stopped"):
+        read_model(tmp_path)
+    (tmp_path / SUMMARY).write_text("{}")
+    with pytest.raises(InputError, match="sparse: no such COLMAP model folder"):
+        read_model(tmp_path)
+    (tmp_path / SUMMARY).unlink()
+    (tmp_path / WORK).rmdir()
+    with pytest.raises(InputError, match="sparse: no such COLMAP model folder"):
+        read_model(tmp_path)
