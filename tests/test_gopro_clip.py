@@ -72,7 +72,7 @@ def test_the_map_is_in_the_right_basin(features, tmp_path, kind, mapper):
         assert np.degrees(np.arccos(normal[2])) < 1.5
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", ["none", "flat"])  # all three: trust/clip_seeds.py
 def test_half_as_many_features_and_other_seeds(features, tmp_path, kind):
     for seed in (1, 2):
         result = run(tmp_path, kind, max_features=4096, seed=seed)
