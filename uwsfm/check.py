@@ -10,9 +10,8 @@ from uwsfm._progress import Progress, silent
 from uwsfm.export.summary import write_json
 from uwsfm.job_log import job_log, logger
 from uwsfm.result_folder import given_rig, open_result
-from uwsfm.trust.diagnosis import diagnose, options_of
-from uwsfm.trust.explanation import Explanation, of_few_observations
-from uwsfm.trust.verdict import FEW_OBSERVATIONS
+from uwsfm.trust.diagnosis import diagnose, moderated, options_of
+from uwsfm.trust.explanation import Explanation
 
 CHECK = "check.json"
 
@@ -51,6 +50,7 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
     rig = given_rig(result.folder)
     model, summary = result.model, result.summary
     with job_log(result.folder, f"uwsfm check {out}", {}, progress) as log:
+        reasons = tuple(summary.get("reasons", ()))
         causes = diagnose(
             rig,
             model.scene,
@@ -58,9 +58,7 @@ def check_result(out: str | Path, progress: Progress = silent) -> Check:
             log.progress,
             **options_of(result.calibration),
         )
-        reasons = tuple(summary.get("reasons", ()))
-        if FEW_OBSERVATIONS in {one["code"] for one in reasons}:
-            causes = tuple(map(of_few_observations, causes))
+        causes = moderated(causes, {one["code"] for one in reasons})
         found = Check(
             verdict=summary.get("verdict"), reasons=reasons, explanations=causes
         )

@@ -25,6 +25,7 @@ from uwsfm.models.lens_wide import (
     THIN_PRISM,
     dir_from_wide,
     distort_wide,
+    scaled,
     wide_by_params,
     wide_limit,
 )
@@ -223,15 +224,7 @@ def _distort_fisheye(u, v, lens):
     scale = value / radius
     # d(scale) / d(radius) / radius
     scale_r = (slope / (1.0 + s) - scale) / s
-    xv = u * v * scale_r
-    return (
-        u * scale,
-        v * scale,
-        scale + u * u * scale_r,
-        xv,
-        xv,
-        scale + v * v * scale_r,
-    )
+    return scaled(u, v, scale, scale_r)
 
 
 @inner

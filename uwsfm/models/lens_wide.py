@@ -53,6 +53,18 @@ def distort_wide(u, v, lens):
         q = math.sqrt(lens[5] * s + 1.0)
         scale = 1.0 / (lens[4] * q + 1.0 - lens[4])
         scale_r = -lens[4] * lens[5] / q * scale * scale
+    return scaled(u, v, scale, scale_r)
+
+
+@inner
+def scaled(u, v, scale, scale_r):
+    """(u, v) scaled by a function of their radius, and the derivatives as 4 scalars.
+
+    Args:
+        u, v: place.
+        scale: the factor there.
+        scale_r: its derivative by the radius, over the radius.
+    """
     xv = u * v * scale_r
     return (
         u * scale,
@@ -86,21 +98,14 @@ def _fov_scale(s, lens):
 
 @inner
 def _prism_plane(u, v):
-    """Coordinates on the plane of angles, and their derivatives (4): equidistant."""
+    """Coordinates on the plane of angles, equidistant, and derivatives as 4 scalars."""
     s = u * u + v * v
     radius = math.sqrt(s)
     scale, scale_r = 1.0 - s / 3.0, -2.0 / 3.0
     if radius > 1e-4:
         scale = math.atan(radius) / radius
         scale_r = (1.0 / (1.0 + s) - scale) / s
-    xv = u * v * scale_r
-    return (
-        u * scale,
-        v * scale,
-        scale + u * u * scale_r,
-        xv,
-        scale + v * v * scale_r,
-    )
+    return scaled(u, v, scale, scale_r)
 
 
 @inner
@@ -122,7 +127,7 @@ def _prism(a, b, lens):
 @inner
 def _thin_prism(u, v, lens):
     nan = math.nan
-    a, b, au, av, bv = _prism_plane(u, v)
+    a, b, au, av, _, bv = _prism_plane(u, v)
     x, y, xa, xb, ya, yb = _prism(a, b, lens)
     if not (a * a + b * b < lens[13] * lens[13] and xa * yb - xb * ya > 0.0):
         return nan, nan, nan, nan, nan, nan
@@ -202,7 +207,7 @@ def wide_by_params(u, v, lens, jac):
     for k in range(4, 12):
         jac[0, k], jac[1, k] = 0.0, 0.0
     if lens[12] == THIN_PRISM:
-        a, b, _, _, _ = _prism_plane(u, v)
+        a, b, _, _, _, _ = _prism_plane(u, v)
         s = a * a + b * b
         power = s
         for k in (4, 5, 8, 9):

@@ -72,9 +72,16 @@ def explain(
         return ()
     scene, _ = calibration.scene.select(calibration.inliers)
     found = diagnose(rig, scene, frame_names, progress, **options_of(calibration))
-    if FEW_OBSERVATIONS in reason_codes:
-        found = tuple(map(of_few_observations, found))
-    return found
+    return moderated(found, reason_codes)
+
+
+def moderated(
+    found: tuple[Explanation, ...], reason_codes: Collection[str]
+) -> tuple[Explanation, ...]:
+    """Explanations in words that claim no more than the verdict's reasons allow."""
+    if FEW_OBSERVATIONS not in reason_codes:
+        return found
+    return tuple(map(of_few_observations, found))
 
 
 def options_of(calibration: CalibrationResult) -> dict[str, Any]:
