@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from uwsfm.cli_dense import _larger_voxels
 from uwsfm.dense.plan import FUSE_BYTES, PLACED_BYTES, Load, plan
 from uwsfm.errors import InputError
 
@@ -24,6 +25,12 @@ def test_little_memory_means_fewer_at_a_time_and_more_time():
     assert tight.matchers == 1 < wide.matchers
     assert tight.seconds > wide.seconds
     assert "42 depth maps, 0.3 Mpx each: about" in str(wide)
+
+
+def test_voxels_that_memory_made_larger_are_told():
+    summary = {"unit": "metre", "voxel": 0.004, "voxel_asked": 0.002}
+    text = _larger_voxels(summary)
+    assert "voxels are 4 mm and not 2 mm" in text and "--max-memory" in text
 
 
 def test_too_little_memory_is_told_before_the_work():

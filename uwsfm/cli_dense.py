@@ -81,11 +81,26 @@ def dense(
             num_threads=threads,
         )
     console.print(_table(result.summary))
+    if result.summary["voxel"] > result.summary["voxel_asked"]:
+        typer.echo(_larger_voxels(result.summary))
     reused = sum(entry["reused"] for entry in result.summary["depth_maps"])
     if reused:
         done = f"{reused} of {len(result.summary['depth_maps'])} depth maps"
         typer.echo(f"{done} were there from an earlier run; the fusion was repeated")
     typer.echo(f"wrote {result.path}")
+
+
+def _larger_voxels(summary: dict[str, Any]) -> str:
+    """Memory decided on the cloud's detail, in place of what was asked for."""
+    from uwsfm.surface.units import length_words
+
+    size, asked = (
+        length_words(summary[key], summary["unit"]) for key in ("voxel", "voxel_asked")
+    )
+    return (
+        f"note: voxels are {size} and not {asked}, which did not fit the memory: a "
+        "larger --max-memory keeps more detail"
+    )
 
 
 def _table(summary: dict[str, Any]) -> "Table":
