@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import uwsfm
 from uwsfm._disk import DiskFullError
 from uwsfm.cli import app
-from uwsfm.dense import maps
+from uwsfm.dense import maps, stereo_maps
 from uwsfm.dense.depth_map import DepthMap
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import WORK
@@ -29,7 +29,7 @@ def dive(tmp_path_factory: pytest.TempPathFactory) -> DenseDive:
 
 def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     made: list[int] = []
-    original = maps.stereo_depth
+    original = stereo_maps.stereo_depth
 
     def stopped_at(limit: int):
         def counted(*arguments):
@@ -38,7 +38,7 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
             made.append(1)
             return original(*arguments)
 
-        monkeypatch.setattr(maps, "stereo_depth", counted)
+        monkeypatch.setattr(stereo_maps, "stereo_depth", counted)
 
     stopped_at(2)
     with pytest.raises(KeyboardInterrupt):
@@ -69,6 +69,38 @@ def test_a_flat_floor_becomes_a_flat_cloud(dive: DenseDive, monkeypatch):
     assert np.all(cloud.num_views >= 2)
 
 
+@pytest.mark.parametrize("case", ["patchmatch", "reduced pairs"])
+def test_other_ways_to_the_same_floor(dive: DenseDive, tmp_path, monkeypatch, case):
+    """Images of both cameras compared with all others, and pairs at half their size."""
+    shutil.copytree(dive.out, tmp_path / "out")
+    options = {"matcher": "patchmatch"}
+    if case != "patchmatch":
+        options = {"matcher": "stereo"}
+        lens = dive.truth.cameras[0]
+        pixels = dict.fromkeys(maps.MAX_STEREO_PIXELS, lens.width * lens.height / 2)
+        monkeypatch.setattr(maps, "MAX_STEREO_PIXELS", pixels)
+    made = uwsfm.dense_cloud(tmp_path / "out", dive.images, **options)
+    expected = 6 if case == "patchmatch" else 3
+    assert len(made.summary["depth_maps"]) == expected
+    if case == "patchmatch":
+        # Those of the other camera are among the neighbours, and so are other frames.
+        compared = made.summary["depth_maps"][0]["compared_with"]
+        assert {"left", "right"} == {Path(name).parent.name for name in compared}
+    else:
+        shape = made.summary["plan"]["megapixels"] * 1e6
+        assert shape == pytest.approx(lens.width * lens.height / 4, rel=0.02)
+    assert made.summary["calibration_stddev_max"]["0-1"] > 0.0
+    cloud = made.cloud
+    middle = cloud.points.mean(axis=0)
+    normal = np.linalg.svd(cloud.points - middle, full_matrices=False)[2][2]
+    height = np.abs((cloud.points - middle) @ normal)
+    # 0.67 if errors were normal. Those of neighbouring depths are alike, and 36 % less
+    # or 30 % more is what three frames leave.
+    assert 0.43 < np.median(height / cloud.stddev) < 0.88
+    assert np.median(height) < 0.0003
+    assert np.median(np.abs(cloud.normals @ normal)) > 0.99
+
+
 def test_each_depth_has_the_deviation_of_its_own_pixel(dive_result):
     """The right port is uncertain by 2 mm, and nothing else, over all of the image."""
     result = uwsfm.open_result(dive_result.out)
@@ -79,7 +111,7 @@ def test_each_depth_has_the_deviation_of_its_own_pixel(dive_result):
     uncertain = replace(result.calibration, covariance=replace(covariance, border=only))
     depths = maps.DepthMaps(replace(result, calibration=uncertain), Path("images"))
     depths.prepare_errors()
-    view = next(view for view in depths.views if view.key == (0, 1))
+    view = next(view for view in depths.views if view.pair == (0, 1))
     ranges = np.full((600, 800), 1.6, dtype=np.float32)
     ranges[300:, :] = 2.1  # a step across the image
     found = depths._calibration(view, DepthMap(ranges=ranges, sensitivity=ranges))
@@ -117,6 +149,7 @@ def test_wrong_input_is_told_in_one_sentence(dive: DenseDive, tmp_path):
     for options, words in (
         ({"max_memory": 1e7}, "--max-memory 0.01GB is too little"),
         ({"voxels": 1}, "unknown option voxels"),
+        ({"matcher": "sgm"}, "--matcher must be one of auto, stereo, patchmatch"),
         ({"noise_px": -1.0}, "--noise-px must be positive"),
         ({"min_views": 99}, "--min-views 99: there are [0-9]+ depth maps"),
         # No two depth maps agree to a millionth of a pixel.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sfm_scenes import model_of
 
-from uwsfm.dense.views import mono_views
+from uwsfm.dense.views import image_views
 from uwsfm.errors import InputError
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
@@ -16,7 +16,7 @@ def test_neighbours_have_parallax_or_there_are_none():
         sample_rig(), rich_motion(5), Relief(), ObservationOptions(num_points=80)
     )
     model = model_of(sample_rig(), simulated.truth)
-    views = mono_views(model)
+    views = image_views(model)
     assert len(views) == 10
     for view in views:
         assert len(view.others) >= 2 and not view.is_stereo
@@ -25,8 +25,8 @@ def test_neighbours_have_parallax_or_there_are_none():
     alone = simulate_scene(
         sample_rig(), rich_motion(1), Relief(), ObservationOptions(num_points=80)
     )
-    with pytest.raises(InputError, match="at least two neighbouring frames"):
-        mono_views(model_of(sample_rig(), alone.truth))
+    with pytest.raises(InputError, match="at least two other images"):
+        image_views(model_of(sample_rig(), alone.truth))
 
 
 def test_all_of_an_image_is_seen_by_some_neighbour():
@@ -35,7 +35,7 @@ def test_all_of_an_image_is_seen_by_some_neighbour():
         sample_rig(), rich_motion(12), Relief(), ObservationOptions(num_points=300)
     )
     scene = simulated.truth
-    views = mono_views(model_of(sample_rig(), scene))
+    views = image_views(model_of(sample_rig(), scene))
     for view in views:
         of_view = scene.point_idx[scene.frame_idx == view.frame]
         frames = [frame for _, frame in view.others]

@@ -49,10 +49,18 @@ def dense(
     quality: Annotated[
         str,
         typer.Option(
-            help="high, medium or low: how far one camera's images are reduced; pairs "
-            "are compared as they are."
+            help="high, medium or low: how far large images are reduced. medium: to "
+            "0.6 megapixels for patchmatch, to 2.4 for stereo."
         ),
     ] = "medium",
+    matcher: Annotated[
+        str,
+        typer.Option(
+            help="stereo: pairs of cameras, rectified (fast). patchmatch: each image "
+            "with six others of any camera. auto: stereo where cameras can be "
+            "rectified."
+        ),
+    ] = "auto",
     max_memory: Annotated[
         str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
     ] = "2GB",
@@ -77,6 +85,7 @@ def dense(
             keep_single=keep_single,
             noise_px=noise_px,
             quality=quality,
+            matcher=matcher,
             max_memory=bytes_of(max_memory),
             num_threads=threads,
         )

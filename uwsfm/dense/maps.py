@@ -6,45 +6,36 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.fuse import Placed, placed
-from uwsfm.dense.match import COST_BYTES, MULTIPLE, Gray
-from uwsfm.dense.mono_maps import MonoMaps
-from uwsfm.dense.options import MAX_PIXELS
-from uwsfm.dense.stereo import BYTES_PER_PIXEL, stereo_depth
+from uwsfm.dense.options import MAX_PIXELS, MAX_STEREO_PIXELS, DenseOptions
+from uwsfm.dense.patchmatch_maps import PatchMatchMaps
+from uwsfm.dense.stereo_maps import StereoMaps
 from uwsfm.dense.views import (
     View,
     cam_from_world,
     image_path,
-    load_image,
-    mono_views,
-    slabs_of,
+    image_views,
     stereo_views,
 )
 from uwsfm.errors import InputError
 from uwsfm.export.files import WORK
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.result_folder import Result, open_result
-from uwsfm.sfm.steps import fingerprint
 
 FOLDER = "dense"
 """In the workspace."""
-BYTES_ON_DISK, MONO_BYTES_ON_DISK = 8, 36
-"""Per pixel: two floats in single precision; those, three of a normal and one of its
-noise, and three of a hypothesis."""
-SMALLEST_TILE = (16 * MULTIPLE) ** 2 * COST_BYTES * 512
-"""Bytes of the matcher."""
-FORMAT = 3
-"""Of the depth maps, what makes them included: others are made again."""
 
 
 def depth_maps(
-    out: str | Path, images: str | Path | None = None, quality: str = "medium"
+    out: str | Path,
+    images: str | Path | None = None,
+    quality: str = "medium",
+    matcher: str = "auto",
 ) -> Iterator[tuple[View, DepthMap]]:
     """The depth maps that `dense_cloud` made of a result folder.
 
@@ -52,12 +43,14 @@ def depth_maps(
         out: the folder.
         images: the images' folder; default: where they were.
         quality: that they were made with.
+        matcher: likewise.
 
     Raises:
         InputError: the folder or an image is not usable, or a depth map is missing.
     """
     result = open_result(out, images)
-    maps = DepthMaps(result, result.require_images(), quality)
+    options = DenseOptions(quality=quality, matcher=matcher)
+    maps = DepthMaps(result, result.require_images(), options)
     for index, view in enumerate(maps.views):
         yield view, maps.read(index)
 
@@ -68,27 +61,48 @@ class DepthMaps:
     Args:
         result: the reconstruction.
         images: folder of its images.
-        quality: one of `MAX_PIXELS`, for the images of single cameras.
+        options: of them, quality and matcher.
 
     Raises:
-        InputError: no two cameras of the rig can be compared, or, of a single one, no
-            two frames.
+        InputError: no two cameras of the rig can be compared, or no two frames.
     """
 
-    def __init__(self, result: Result, images: Path, quality: str = "medium") -> None:
+    def __init__(
+        self, result: Result, images: Path, options: DenseOptions | None = None
+    ) -> None:
+        options = options or DenseOptions()
         self.model, self.images = result.model, images
-        self.refused: dict[tuple[int, int], str] = {}
-        if len(self.model.scene.cameras) > 1:
-            self.views, self.refused = stereo_views(self.model)
-        else:
-            self.views = mono_views(self.model)
         self._work = result.folder / WORK / FOLDER
-        pixels = MAX_PIXELS[quality]
-        self._mono: MonoMaps | None = None
-        if not self.views[0].is_stereo:
-            self._mono = MonoMaps(self.model, images, self._work, self.views, pixels)
+        self.views, self.refused = self._views(options.matcher)
+        self._maker: StereoMaps | PatchMatchMaps
+        if self.views[0].is_stereo:
+            pixels = MAX_STEREO_PIXELS[options.quality]
+            self._maker = StereoMaps(self.model, images, self.views, pixels)
+        else:
+            self._maker = PatchMatchMaps(
+                *(self.model, images, self._work),
+                self.views,
+                MAX_PIXELS[options.quality],
+            )
         self._covariance = result.calibration.covariance
         self.errors: dict[tuple[int, int], CalibrationError | None] = {}
+
+    def _views(self, matcher: str) -> tuple[list[View], dict[tuple[int, int], str]]:
+        """The views, and why pairs of cameras are not compared in rectified images."""
+        if matcher == "patchmatch" or len(self.model.scene.cameras) == 1:
+            return image_views(self.model), {}
+        try:
+            return stereo_views(self.model)
+        except InputError:
+            if matcher == "stereo":
+                raise
+            # Cameras that turn away from each other: frames are compared instead.
+            return image_views(self.model), {}
+
+    @property
+    def is_stereo(self) -> bool:
+        """Whether pairs of cameras are compared, in rectified images."""
+        return self._maker.is_stereo
 
     def require_images(self) -> None:
         """Look for all images before the first is matched.
@@ -105,35 +119,29 @@ class DepthMaps:
         needed = 0
         for view in self.views:
             if not self._path(view).exists():
-                each = BYTES_ON_DISK if view.is_stereo else MONO_BYTES_ON_DISK
                 camera = self.camera(view)
-                needed += each * camera.width * camera.height
+                needed += self._maker.bytes_on_disk * camera.width * camera.height
         return needed
 
     def camera(self, view: View) -> RefractiveCamera:
-        """Of the depth map: reduced as it is."""
-        if self._mono is not None:
-            return self._mono.camera(view.camera)
-        return self.model.scene.cameras[view.camera]
+        """The camera of a depth map: reduced as it is."""
+        return self._maker.camera(view.camera)
 
     def color(self, index: int) -> NDArray[np.uint8]:
         """The image of a depth map (H, W, 3), blue, green, red."""
         view = self.views[index]
-        if self._mono is not None:
-            return self._mono.color(view.camera, view.name)
-        return load_image(self.model, self.images, view.camera, view.name)
+        return self._maker.color(view.camera, view.name)
 
     @property
     def num_passes(self) -> int:
         """Over all views, before the depth maps are there."""
-        return 1 if self._mono is None else 2
+        return 2 if self._maker.has_search else 1
 
     def search(self, index: int) -> None:
         """The first pass over a view, where there are two; none if its map is there."""
         view = self.views[index]
-        assert self._mono is not None
-        if read_depth_map(self._path(view), self._key(index)) is None:
-            self._mono.search(index)
+        if read_depth_map(self._path(view), self._maker.key(index)) is None:
+            self._maker.search(index)
 
     def make(self, index: int, budget: float) -> dict[str, Any]:
         """Make a depth map unless it is there; what is known of it.
@@ -143,62 +151,28 @@ class DepthMaps:
             budget: bytes that may be allocated.
         """
         view = self.views[index]
-        path, key = self._path(view), self._key(index)
-        slabs = slabs_of(self.model, view) if view.is_stereo else ()
+        path, key = self._path(view), self._maker.key(index)
         depth = read_depth_map(path, key)
         reused = depth is not None
         if depth is None:
-            if self._mono is not None:
-                depth = self._mono.depth(index)
-            else:
-                left = self._gray(view.camera, view.name)
-                right = self._gray(view.others[0][0], view.other_names[0])
-                depth = stereo_depth(slabs, left, right, budget)
+            depth = self._maker.depth(index, budget)
             write_depth_map(depth, path, key)
         return {
             "image": view.name,
             "compared_with": list(view.other_names),
             "near": view.near,
             "far": view.far,
-            "num_slabs": len(slabs) or None,
-            "deviation_px": max((slab.deviation_px for slab in slabs), default=None),
+            **self._maker.facts(index),
             "share_matched": depth.num_valid / depth.ranges.size,
             "reused": reused,
         }
 
     def bytes_of(self, index: int) -> float:
-        """What `make` needs of a view, with the smallest tiles."""
-        view = self.views[index]
-        if self._mono is not None:
-            return self._mono.bytes_of(index)
-        pixels = max(s.size[0] * s.size[1] for s in slabs_of(self.model, view))
-        return BYTES_PER_PIXEL * pixels + SMALLEST_TILE
-
-    def _gray(self, camera: int, name: str) -> Gray:
-        image = load_image(self.model, self.images, camera, name)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        """Bytes that `make` needs of a view, at least."""
+        return self._maker.bytes_of(index)
 
     def _path(self, view: View) -> Path:
-        other = view.key[1] if view.is_stereo else "patchmatch"
-        name = f"{view.frame:06d}_{view.camera}-{other}.npz"
-        return self._work / name
-
-    def _key(self, index: int) -> str:
-        """Of all that a depth map depends on."""
-        if self._mono is not None:
-            return self._mono.key(index)
-        view, scene = self.views[index], self.model.scene
-        cameras = [
-            (scene.cameras[c].lens.tolist(), scene.cameras[c].port.row.tolist())
-            for c in view.key
-        ]
-        files = []
-        for name in (view.name, *view.other_names):
-            status = image_path(self.images, name).stat()
-            files.append((name, status.st_size, status.st_mtime_ns))
-        # Of the rig, to the last digit, wherever the frame is.
-        poses = scene.cam_from_rig[list(view.key)].tolist()
-        return fingerprint([FORMAT, cameras, files, poses, view.near, view.far])
+        return self._work / self._maker.name(view)
 
     def read(self, index: int) -> DepthMap:
         """A depth map that was made.
@@ -207,7 +181,7 @@ class DepthMaps:
             InputError: it was not, or not of these images and this calibration.
         """
         view = self.views[index]
-        depth = read_depth_map(self._path(view), self._key(index))
+        depth = read_depth_map(self._path(view), self._maker.key(index))
         if depth is None:
             raise InputError(f"{self._path(view)} is missing or old: run uwsfm dense")
         return depth
@@ -226,15 +200,16 @@ class DepthMaps:
     def _calibration(self, view: View, depth: DepthMap) -> Any:
         height, width = depth.ranges.shape
         found = np.zeros((height, width), dtype=np.float32)
-        error = self.errors.get(view.key)
+        error = self.errors.get(view.pair)
         if error is None:
             return found
         rows = max(1, 200_000 // width)
-        camera = self.model.scene.cameras[view.camera]
+        camera, factor = self.camera(view), self._maker.factor(view.camera)
         for top in range(0, height, rows):
             bottom = min(top + rows, height)
             values = error.stddev(
-                pixel_rows(camera, top, bottom), depth.ranges[top:bottom].ravel()
+                factor * pixel_rows(camera, top, bottom),
+                depth.ranges[top:bottom].ravel(),
             )
             found[top:bottom] = values.reshape(bottom - top, width)
         return np.nan_to_num(found)
@@ -242,8 +217,8 @@ class DepthMaps:
     def prepare_errors(self) -> None:
         """Find what the calibration adds, before `placed` is called."""
         covariance = self._covariance
-        for key in {view.key for view in self.views}:
-            of_key = [view for view in self.views if view.key == key]
+        for key in {view.pair for view in self.views}:
+            of_key = [view for view in self.views if view.pair == key]
             self.errors[key] = None
             if key[0] == key[1]:
                 continue  # between frames it is the poses that err

@@ -12,8 +12,11 @@ from uwsfm.tasks import require_threads
 ASSUMED_NOISE_PX = 0.3
 """Of a disparity, where too few depth maps overlap to tell."""
 MAX_PIXELS = {"high": 2.4e6, "medium": 0.6e6, "low": 0.15e6}
-"""That one camera's images are reduced to: half of a GoPro's, a quarter of it each
+"""That images are reduced to for PatchMatch: half of a GoPro's, a quarter of it each
 way, and so on. Finer than the water is clear, pixels cost time and bring noise."""
+MAX_STEREO_PIXELS = {"high": 12e6, "medium": 2.4e6, "low": 0.6e6}
+"""The same of pairs in rectified images, which take a tenth of the time."""
+MATCHERS = ("auto", "stereo", "patchmatch")
 _UNITS = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9}
 
 
@@ -34,7 +37,10 @@ class DenseOptions:
     max_neighbours: int = 8
     """Depth maps that each one is compared with."""
     quality: str = "medium"
-    """high, medium or low: how far the images of one camera are reduced."""
+    """high, medium or low: how far large images are reduced."""
+    matcher: str = "auto"
+    """stereo: pairs of cameras in rectified images. patchmatch: every image with six
+    others of any camera and frame. auto: stereo where cameras can be rectified."""
     max_memory: float = 2e9
     """Bytes that the whole process may use."""
     num_threads: int = -1
@@ -50,6 +56,9 @@ class DenseOptions:
         if self.quality not in MAX_PIXELS:
             known = ", ".join(MAX_PIXELS)
             raise InputError(f"--quality must be one of {known}, got {self.quality!r}")
+        if self.matcher not in MATCHERS:
+            known = ", ".join(MATCHERS)
+            raise InputError(f"--matcher must be one of {known}, got {self.matcher!r}")
         for name in ("voxel", "noise_px", "max_memory"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:

@@ -93,7 +93,8 @@ def choose(costs, x, y, reach, share, chosen, nearby):
     Args:
         costs: (h, w, S + 1).
         reach: `REACH`.
-        share: (S + 3,), written: the last three are the shares of those chosen.
+        share: (S + 9,), written: from S on the shares of the three chosen. What
+            hypotheses cost there follows: of the last one, and of the best.
         chosen: (3,), written.
         nearby: (4, 2), written: the pixels with the best hypothesis of each direction.
             They have a say beside the pixel itself.
@@ -141,13 +142,16 @@ def _worth(costs, x, y, nearby, s):
 
 @inner
 def _score(seen, x, y, w, gx, gy, num, choice, offsets, patch, deviation, limit):
-    """Cost of a hypothesis over the neighbours that count; more than limit: any."""
+    """Cost of a hypothesis over the neighbours that count; more than limit: any.
+
+    The cost in each of them is left behind their shares.
+    """
     chosen, share, count = choice
-    total = _ZERO
+    total, tried = _ZERO, num + NUM_CHOSEN
     for n in range(count):
-        total += share[num + n] * view_cost(
-            seen, chosen[n], x, y, w, gx, gy, offsets, patch, deviation
-        )
+        cost = view_cost(seen, chosen[n], x, y, w, gx, gy, offsets, patch, deviation)
+        share[tried + n] = cost
+        total += share[num + n] * cost
         if total >= limit:
             break
     return total
@@ -180,7 +184,7 @@ def spread(image, seen, planes, costs, tables, chance, limits, scratch):
         limits: (6,) float32: least and largest inverse depth, focal length in pixels,
             and how far chance goes: pixels in the neighbours, tangent of the slope;
             share of pixels that try any depth.
-        scratch: (2, K) float32, (S + 3,) float32, (3,) and (4, 2) int64.
+        scratch: (2, K) float32, (S + 9,) float32, (3,) and (4, 2) int64.
     """
     height, width = image.shape
     offsets, weights, reach = tables
@@ -245,10 +249,29 @@ def _improve(seen, x, y, planes, costs, choice, nearby, own, limits, state):
         )
         if score < best:
             best, w, gx, gy, changed = score, tw, tx, ty, True
+            for m in range(count):
+                share[num + 2 * NUM_CHOSEN + m] = share[num + NUM_CHOSEN + m]
     costs[y, x, num] = best
     if changed:
         planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, gx, gy
-        _all_costs(seen, x, y, planes, offsets, patch, deviation, costs)
+        _other_costs(seen, x, y, (w, gx, gy), choice, own, costs)
+
+
+@inner
+def _other_costs(seen, x, y, hypothesis, choice, own, costs):
+    """Costs of a new hypothesis: known in those that count, found in the others."""
+    (w, gx, gy), (chosen, share, count) = hypothesis, choice
+    offsets, patch, deviation = own
+    num = costs.shape[2] - 1
+    for s in range(num):
+        rated = False
+        for n in range(count):
+            if chosen[n] == s:
+                costs[y, x, s], rated = share[num + 2 * NUM_CHOSEN + n], True
+        if not rated:
+            costs[y, x, s] = view_cost(
+                seen, s, x, y, w, gx, gy, offsets, patch, deviation
+            )
 
 
 @inner

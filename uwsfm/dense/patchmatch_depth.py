@@ -265,7 +265,7 @@ def _focal(camera: RefractiveCamera) -> float:
 def _scratch(num_samples: int, num: int) -> tuple[Any, ...]:
     return (
         np.empty((2, num_samples), dtype=np.float32),
-        np.empty(num + patchmatch.NUM_CHOSEN, dtype=np.float32),
+        np.empty(num + 3 * patchmatch.NUM_CHOSEN, dtype=np.float32),
         np.empty(patchmatch.NUM_CHOSEN, dtype=np.int64),
         np.empty((4, 2), dtype=np.int64),
     )

@@ -3,13 +3,44 @@
 from __future__ import annotations
 
 import copy
+import math
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.colmap import Model
+from uwsfm.dense.views import load_image
 from uwsfm.models.refractive import RefractiveCamera
+
+
+class Reduced:
+    """The images of a model, reduced where they are larger than they need to be.
+
+    Args:
+        model: the reconstruction.
+        images: folder of its images.
+        max_pixels: larger images are reduced by a whole number.
+    """
+
+    def __init__(self, model: Model, images: Path, max_pixels: float) -> None:
+        self._model, self._images, self._max_pixels = model, images, max_pixels
+
+    def factor(self, camera: int) -> int:
+        """Pixels of an image, across, that become one."""
+        lens = self._model.scene.cameras[camera]
+        return max(1, math.ceil(math.sqrt(lens.width * lens.height / self._max_pixels)))
+
+    def camera(self, camera: int) -> RefractiveCamera:
+        """The camera of the reduced images."""
+        return reduced_camera(self._model.scene.cameras[camera], self.factor(camera))
+
+    def image(self, camera: int, name: str) -> NDArray[Any]:
+        """A reduced image (h, w, 3), blue, green, red."""
+        image = load_image(self._model, self._images, camera, name)
+        return reduced_image(image, self.factor(camera))
 
 
 def reduced_camera(camera: RefractiveCamera, factor: int) -> RefractiveCamera:

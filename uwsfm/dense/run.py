@@ -100,7 +100,7 @@ class _Run:
     ) -> None:
         self.result, self.images, self.options = result, images, options
         self.model, self.progress = result.model, progress
-        self.maps = DepthMaps(result, images, options.quality)
+        self.maps = DepthMaps(result, images, options)
         self.views = self.maps.views
         cores = os.cpu_count() or 1
         self.threads = cores if options.num_threads < 1 else options.num_threads
@@ -231,11 +231,12 @@ class _Run:
         import psutil
 
         cameras = [self.maps.camera(view) for view in self.views]
-        largest = {view.key: index for index, view in enumerate(self.views)}
+        # Views of the same cameras are alike.
+        largest = {view.pair: index for index, view in enumerate(self.views)}
         load = Load(
             pixels=[camera.width * camera.height for camera in cameras],
             map_bytes=max(self.maps.bytes_of(index) for index in largest.values()),
-            is_stereo=self.views[0].is_stereo,
+            is_stereo=self.maps.is_stereo,
             neighbours=self.options.max_neighbours,
         )
         used = float(psutil.Process().memory_info().rss)

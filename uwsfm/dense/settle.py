@@ -13,6 +13,8 @@ from uwsfm.dense.patch import RADIUS, affine, objection, shows, take_patch
 from uwsfm.dense.patchmatch import choose
 
 NUM_STEPS = 2
+STILL_PX = 0.03
+"""A step so short ends them: what it leaves is its square."""
 HYPOTHESIS_PX = 1.0
 """Standard deviation of a hypothesis, pixels in the neighbours."""
 AGREES_PX = 1.5
@@ -76,7 +78,7 @@ def settle(image, seen, planes, costs, tables, scratch, found):
         planes: (h, w, 3) hypotheses.
         costs: (h, w, S + 1) of them.
         tables: `patch_offsets` (every pixel), `color_weights`, `REACH`.
-        scratch: (2, K) float32, (S + 3,) float32, (3,) and (4, 2) int64.
+        scratch: (2, K) float32, (S + 9,) float32, (3,) and (4, 2) int64.
         found: (h, w, 5), written: inverse depth; pixels that a point moves in the
             neighbours per inverse depth, root mean square; deviation in those pixels;
             correlation; how many neighbours have the surface there, too. NaN where no
@@ -124,7 +126,7 @@ def _settled(seen, x, y, planes, choice, own, found):
             correlation += like
             moves += uw * uw + vw * vw
             used += 1
-            if step == NUM_STEPS and seen[4].shape[1] > 0:
+            if seen[4].shape[1] > 0:
                 apart = objection(seen, s, x, y, w, u, v, uw, vw)
                 agreeing += 1 if apart < _F(AGREES_PX) else 0
         if used == 0:
@@ -137,6 +139,8 @@ def _settled(seen, x, y, planes, choice, own, found):
         if step < NUM_STEPS:
             change = (e - damping * (w - planes[y, x, 0])) / (h + damping)
             w += min(max(change, -_ONE / moves), _ONE / moves)
+            if abs(change) * moves < _F(STILL_PX):
+                break
     found[y, x, 0], found[y, x, 1], found[y, x, 3] = w, moves, correlation
     found[y, x, 2] = moves * np.sqrt(noise / (h + damping))
     found[y, x, 4] = _F(agreeing)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from uwsfm.colmap import Model
-from uwsfm.dense.rectify import Pair, Rectification, rectifications
+from uwsfm.dense.rectify import Pair, rectifications
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -48,13 +50,15 @@ class View:
     far: float
 
     @property
-    def key(self) -> tuple[int, int]:
-        """Its camera and that of the others."""
-        return self.camera, self.others[0][0]
+    def pair(self) -> tuple[int, int]:
+        """Its camera and another one of the same frame; twice its own if none is."""
+        beside = (c for c, frame in self.others if frame == self.frame)
+        return self.camera, next(beside, self.camera)
 
     @property
     def is_stereo(self) -> bool:
-        return self.others[0][1] == self.frame
+        """Whether it is compared with the other camera of a pair, and nothing else."""
+        return len(self.others) == 1
 
 
 def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
@@ -109,14 +113,14 @@ def stereo_views(model: Model) -> tuple[list[View], dict[tuple[int, int], str]]:
     return views, refused
 
 
-def mono_views(model: Model) -> list[View]:
-    """Depth maps of one camera's images from its neighbouring frames.
+def image_views(model: Model) -> list[View]:
+    """Depth maps of all images, each from others that see the same from elsewhere.
 
     Raises:
-        InputError: no frame has two neighbours that see the same from elsewhere.
+        InputError: no image has two such neighbours.
     """
     scene = model.scene
-    seen = _seen_points(scene)
+    seen = _points_of_images(scene)
     depths = scene.points_in_cam()[:, 2]
     views = []
     for camera in range(len(scene.cameras)):
@@ -127,8 +131,11 @@ def mono_views(model: Model) -> list[View]:
             own = depths[rows & np.isfinite(depths)]
             if len(own) < MIN_POINTS:
                 continue
-            best = _partners(scene, seen, frame)
-            chosen = [f for f in best if model.has_image(camera, f)][:NUM_SOURCES]
+            chosen = [
+                other
+                for other in _partners(scene, seen, (camera, frame))
+                if model.has_image(*other)
+            ][:NUM_SOURCES]
             if len(chosen) < 2:
                 continue
             near, far = _limits(own)
@@ -137,55 +144,65 @@ def mono_views(model: Model) -> list[View]:
                     camera=camera,
                     frame=frame,
                     name=model.image_name(camera, frame),
-                    others=tuple((camera, f) for f in chosen),
-                    other_names=tuple(model.image_name(camera, f) for f in chosen),
+                    others=tuple(chosen),
+                    other_names=tuple(model.image_name(*other) for other in chosen),
                     near=near,
                     far=far,
                 )
             )
     if not views:
         raise InputError(
-            "no frame can be compared: depth from one camera takes at least two "
-            "neighbouring frames that see the same points from elsewhere"
+            "no frame can be compared: depth takes at least two other images that see "
+            "the same points from elsewhere, such as neighbouring frames"
         )
     return views
 
 
-def _partners(scene: Scene, seen: csr_array, frame: int) -> list[int]:
-    """Frames to compare one with, the most useful first.
+def _partners(
+    scene: Scene, seen: csr_array, image: tuple[int, int]
+) -> list[tuple[int, int]]:
+    """Images to compare one with, the most useful first: camera and frame.
 
     Each adds points with parallax, and those that others have seen already count less:
     so all of the image is seen by some.
+
+    Args:
+        scene: the reconstruction.
+        seen: of `_points_of_images`.
+        image: camera and frame.
     """
-    points = seen[[frame]].indices
+    index = image[0] * scene.num_frames + image[1]
+    points = seen[[index]].indices
     points = points[np.isfinite(scene.points[points]).all(axis=1)]
     shared = seen[:, points]
     counts = np.asarray(shared.sum(axis=1)).ravel()
-    counts[frame] = 0.0
+    counts[index] = 0.0
     candidates = np.argsort(-counts, kind="stable")[:MAX_CANDIDATES]
     candidates = candidates[counts[candidates] >= MIN_POINTS]
     if not len(candidates):
         return []
-    centers = rigid3.inverse(scene.rig_from_world)[:, 4:]
 
-    def sights(f: int) -> Array:
-        sight = scene.points[points] - centers[f]
+    def sights(other: int) -> Array:
+        camera, frame = divmod(int(other), scene.num_frames)
+        pose = rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world[frame])
+        sight = scene.points[points] - rigid3.inverse(pose)[4:]
         return sight / np.linalg.norm(sight, axis=1, keepdims=True)
 
-    own = sights(frame)
+    own = sights(index)
     worth = shared[candidates].toarray()
-    for row, f in zip(worth, candidates, strict=True):
-        angle = np.arccos(np.clip(np.sum(own * sights(int(f)), axis=1), -1.0, 1.0))
+    for row, other in zip(worth, candidates, strict=True):
+        angle = np.arccos(np.clip(np.sum(own * sights(other), axis=1), -1.0, 1.0))
         row *= np.clip(angle / GOOD_PARALLAX, 0.0, 1.0) * (angle > MIN_PARALLAX)
         row *= np.clip((MAX_PARALLAX - angle) / (0.5 * MAX_PARALLAX), 0.05, 1.0)
     needed = np.ones(len(points))
-    found: list[int] = []
+    found: list[tuple[int, int]] = []
     for _ in range(min(len(candidates), 2 * NUM_SOURCES)):
         gains = worth @ needed
         best = int(np.argmax(gains))
         if gains[best] < 1.0:
             break
-        found.append(int(candidates[best]))
+        camera, frame = divmod(int(candidates[best]), scene.num_frames)
+        found.append((camera, frame))
         needed *= 1.0 - 0.5 * np.clip(worth[best], 0.0, 1.0)
         worth[best] = 0.0
     return found
@@ -203,15 +220,6 @@ def pair_of(model: Model, left: int, right: int, near: float, far: float) -> Pai
         near=near,
         far=far,
     )
-
-
-def slabs_of(model: Model, view: View) -> tuple[Rectification, ...]:
-    """The rectified pairs of a view.
-
-    Raises:
-        InputError: the cameras share too little view at the depths of this frame.
-    """
-    return rectifications(pair_of(model, *view.key, view.near, view.far))
 
 
 def cam_from_world(model: Model, camera: int, frame: int) -> Array:
@@ -238,17 +246,29 @@ def neighbours(model: Model, views: list[View], limit: int) -> list[list[int]]:
     return found
 
 
-def _seen_points(scene: Scene) -> csr_array:
-    """Which points frames see, (F, N)."""
-    shape = scene.num_frames, scene.num_points
-    pairs = np.unique(np.stack([scene.frame_idx, scene.point_idx], axis=1), axis=0)
+def _seen_points(rows: NDArray[Any], num_rows: int, scene: Scene) -> csr_array:
+    """Which points some rows, images or frames, see (num_rows, N).
+
+    Args:
+        rows: (M,) row of each observation.
+        num_rows: how many there are.
+        scene: the reconstruction.
+    """
+    pairs = np.unique(np.stack([rows, scene.point_idx], axis=1), axis=0)
+    shape = num_rows, scene.num_points
     ones = np.ones(len(pairs))
     return coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape).tocsr()
 
 
+def _points_of_images(scene: Scene) -> csr_array:
+    """Which points images see, row camera * F + frame, (C * F, N)."""
+    images = scene.camera_idx * scene.num_frames + scene.frame_idx
+    return _seen_points(images, len(scene.cameras) * scene.num_frames, scene)
+
+
 def _shared_points(scene: Scene) -> csr_array:
     """How many points two frames share, (F, F)."""
-    seen = _seen_points(scene)
+    seen = _seen_points(scene.frame_idx, scene.num_frames, scene)
     return (seen @ seen.T).tocsr()
 
 

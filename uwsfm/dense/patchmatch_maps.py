@@ -1,4 +1,4 @@
-"""Depth maps of one camera's images, in two passes over all of them.
+"""Depth maps by PatchMatch, of images of any cameras, in two passes over all of them.
 
 The first finds hypotheses by likeness alone, the second goes on from there with what
 the neighbours found at hand: what they object to becomes dear. Hypotheses wait in the
@@ -7,7 +7,6 @@ workspace, so that a run that was stopped goes on.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +23,33 @@ from uwsfm.dense.patchmatch_depth import (
     depth_map_of,
     patchmatch_bytes,
 )
-from uwsfm.dense.reduced import reduced_camera, reduced_image
-from uwsfm.dense.views import View, cam_from_world, image_path, load_image
+from uwsfm.dense.reduced import Reduced
+from uwsfm.dense.views import View, cam_from_world, image_path
 from uwsfm.dense.warp import Placement
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.steps import fingerprint
 
 FORMAT = 3
 """Of the hypotheses and of what is made of them: others are made again."""
 
 
-class MonoMaps:
-    """Of the views of single cameras.
+class PatchMatchMaps:
+    """Depth maps of the views of `image_views`.
 
     Args:
         model: the reconstruction.
         images: folder of its images.
         work: folder of the hypotheses.
-        views: those of `mono_views`.
+        views: one per image.
         max_pixels: larger images are reduced by a whole number.
     """
+
+    bytes_on_disk = 36
+    """Per pixel: two floats in single precision, three of a normal, one of the spread,
+    and a quarter of three of the first pass."""
+    has_search = True
+    is_stereo = False
 
     def __init__(
         self,
@@ -56,22 +60,22 @@ class MonoMaps:
         max_pixels: float,
     ) -> None:
         self._model, self._images, self._work = model, images, work
-        self._views, self._max_pixels = views, max_pixels
+        self._views = views
+        self._reduced = Reduced(model, images, max_pixels)
+        self.camera, self.factor = self._reduced.camera, self._reduced.factor
         self._index = {(view.camera, view.frame): i for i, view in enumerate(views)}
 
-    def factor(self, camera: int) -> int:
-        """Pixels of an image, across, that become one."""
-        lens = self._model.scene.cameras[camera]
-        return max(1, math.ceil(math.sqrt(lens.width * lens.height / self._max_pixels)))
-
-    def camera(self, camera: int) -> RefractiveCamera:
-        """As the reduced images have it."""
-        return reduced_camera(self._model.scene.cameras[camera], self.factor(camera))
+    def name(self, view: View) -> str:
+        """File of its depth map."""
+        return f"{view.frame:06d}_{view.camera}-patchmatch.npz"
 
     def color(self, camera: int, name: str) -> NDArray[Any]:
-        """The reduced image (h, w, 3), blue, green, red."""
-        image = load_image(self._model, self._images, camera, name)
-        return reduced_image(image, self.factor(camera))
+        """An image (h, w, 3) as it is compared, blue, green, red."""
+        return self._reduced.image(camera, name)
+
+    def facts(self, index: int) -> dict[str, Any]:
+        """What the summary reports of rectified images: there are none."""
+        return {"num_slabs": None, "deviation_px": None}
 
     def search(self, index: int) -> None:
         """The first pass over a view, unless its hypotheses are there."""
@@ -81,7 +85,7 @@ class MonoMaps:
         planes = self._patchmatch(index).search(self._points(index))
         write_planes(path, key, {"planes": planes})
 
-    def depth(self, index: int) -> DepthMap:
+    def depth(self, index: int, budget: float) -> DepthMap:
         """The second pass; the first must have been made of all views."""
         view = self._views[index]
         found = [self._hypotheses(other) for other in view.others]
