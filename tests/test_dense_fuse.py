@@ -9,7 +9,7 @@ from dense_scenes import Plane, range_errors
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
-from uwsfm.dense.fuse import fuse, noise_px, placed, robust_stddev
+from uwsfm.dense.fuse import Rule, fuse, noise_px, placed, robust_stddev
 from uwsfm.dense.options import DenseOptions, bytes_of
 from uwsfm.dense.voxels import BYTES_PER_VOXEL, Fused, Voxels
 from uwsfm.errors import InputError
@@ -60,7 +60,7 @@ def test_depth_maps_tell_their_noise_and_average_it(rng: np.random.Generator):
     assert found == pytest.approx(NOISE_PX * np.sqrt(13.0 / 18.0), rel=0.1)
     image = np.zeros((60, 80, 3), dtype=np.uint8)
     fused, counts = fuse(
-        maps[0], maps[1:], image, NOISE_PX, min_views=3, keep_single=False
+        *(maps[0], maps[1:], image, NOISE_PX), Rule(min_views=3, keep_single=False)
     )
     all_agree = fused.num_views == 5
     height = fused.points[all_agree, 2]
@@ -84,9 +84,9 @@ def test_errors_of_the_calibration_are_in_every_point_and_not_averaged(rng):
     systematic = np.linspace(0.003, 0.011, shape[0] * shape[1]).reshape(shape)
     uncertain = replace(plain[0], calibration=systematic.astype(np.float32))
     image = np.zeros((*shape, 3), dtype=np.uint8)
-    rule = {"min_views": 2, "keep_single": False}
-    without, _ = fuse(plain[0], plain[1:], image, NOISE_PX, **rule)
-    found, _ = fuse(uncertain, plain[1:], image, NOISE_PX, **rule)
+    rule = Rule(min_views=2, keep_single=False)
+    without, _ = fuse(plain[0], plain[1:], image, NOISE_PX, rule)
+    found, _ = fuse(uncertain, plain[1:], image, NOISE_PX, rule)
     np.testing.assert_array_equal(found.points, without.points)
     # Which pixel a point is of: the one that it projects to.
     pose = plain[0].cam_from_world
@@ -100,15 +100,16 @@ def test_what_others_contradict_is_dropped(rng: np.random.Generator):
     maps = maps_of_floor(rng, 4, bump=0.1)
     image = np.zeros((60, 80, 3), dtype=np.uint8)
     image[..., 0] = 200  # blue
-    rule = {"min_views": 2, "keep_single": True}
-    fused, counts = fuse(maps[3], maps[:3], image, NOISE_PX, **rule)
+    rule = Rule(min_views=2, keep_single=True)
+    fused, counts = fuse(maps[3], maps[:3], image, NOISE_PX, rule)
     # Ten standard deviations off; its border has no normal.
     assert counts.num_contradicted >= 250
     assert np.all(np.abs(fused.points[:, 2]) < 0.03)
     assert np.all(fused.colors == [0, 0, 200])
-    alone, _ = fuse(maps[3], [], image, NOISE_PX, **rule)
+    alone, _ = fuse(maps[3], [], image, NOISE_PX, rule)
     assert np.all(alone.num_views == 1) and len(alone) > 4000
-    nothing, _ = fuse(maps[3], [], image, NOISE_PX, min_views=2, keep_single=False)
+    strict = Rule(min_views=2, keep_single=False)
+    nothing, _ = fuse(maps[3], [], image, NOISE_PX, strict)
     assert len(nothing) == 0
 
 

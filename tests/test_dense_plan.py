@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from uwsfm.cli_dense import _larger_voxels
-from uwsfm.dense.plan import FUSE_BYTES, PLACED_BYTES, Load, plan
+from uwsfm.dense.plan import Load, fused_bytes, plan
 from uwsfm.errors import InputError
 
 LOAD = Load(pixels=[270_000] * 42, map_bytes=3e8, is_stereo=False, neighbours=8)
@@ -16,7 +16,7 @@ def test_all_that_is_planned_fits():
         found = plan(LOAD, memory, 4e8, threads=8)
         room = memory - 4e8
         assert found.matchers * LOAD.map_bytes <= room
-        fuse = 270_000 * (FUSE_BYTES + 9 * PLACED_BYTES) * found.fusers
+        fuse = fused_bytes(270_000, 8) * found.fusers
         assert fuse + found.store_bytes + found.voxel_bytes <= room * 1.0001
 
 

@@ -97,7 +97,7 @@ def test_other_ways_to_the_same_floor(dive: DenseDive, tmp_path, monkeypatch, ca
     # 0.67 if errors were normal. Those of neighbouring depths are alike, and 36 % less
     # or 30 % more is what three frames leave.
     assert 0.43 < np.median(height / cloud.stddev) < 0.88
-    assert np.median(height) < 0.0003
+    assert np.median(height) < (0.0003 if case == "patchmatch" else 0.0006)
     assert np.median(np.abs(cloud.normals @ normal)) > 0.99
 
 

@@ -46,7 +46,7 @@ def result_with(model, folder):
 def depth_keys(result):
     maps = DepthMaps(result, result.images)
     assert [view.frame for view in maps.views] == [0, 1, 2]
-    return [maps._key(index) for index in range(len(maps.views))]
+    return [maps._maker.key(index) for index in range(len(maps.views))]
 
 
 def changed(before, result):
@@ -110,7 +110,7 @@ def test_a_depth_map_that_is_old_or_missing_is_told(dense):
         ranges=np.full((2, 3), 1.5, np.float32),
         sensitivity=np.full((2, 3), 0.25, np.float32),
     )
-    write_depth_map(depth, path, maps._key(1))
+    write_depth_map(depth, path, maps._maker.key(1))
     found = maps.read(1)
     assert found.ranges[0, 0] == 1.5 and found.sensitivity[1, 2] == 0.25
     write_depth_map(depth, path, "another")

@@ -106,6 +106,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "sfm/start.py": _STEPS,
         "sfm/refractive_steps.py": _STEPS,
         "dense/maps.py": ("test_stale_depth_maps.py",),
+        "dense/stereo_maps.py": ("test_stale_depth_maps.py",),
     },
 }
 """Modules of a kind, and the fast tests that concern each."""
@@ -118,7 +119,8 @@ ONLY = {
         "_rig_content",
     ),
     "sfm/refractive_steps.py": ("map_refractively",),
-    "dense/maps.py": ("_key", "_path", "read", "require_images"),
+    "dense/maps.py": ("_path", "read", "require_images"),
+    "dense/stereo_maps.py": ("key", "name"),
 }
 """Functions of a module that make keys; what steps do has tests that take longer."""
 
@@ -184,7 +186,11 @@ def _forget(module: str, users: Mapping[str, set[str]]) -> None:
             stale.add(name)
             todo += users.get(name, ())
     for name in stale & set(sys.modules):
-        del sys.modules[name]
+        old = sys.modules.pop(name)
+        package, _, last = name.rpartition(".")
+        # ``from package import module`` would find the old one there.
+        if package and vars(sys.modules.get(package, old)).get(last) is old:
+            delattr(sys.modules[package], last)
 
 
 def _tested(

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows, sampled
+from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows
+from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.voxels import Fused
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -22,13 +23,10 @@ AGREE_STDDEVS = 3.0
 HIDDEN_STDDEVS = 15.0
 """A surface that is nearer to another camera by more than this hides the point, and
 says nothing about it."""
-FOLD = 4096
 _NORMAL_REACH = 2
 """Pixels on each side whose points give the normal."""
 _MAX_SLANT = 0.15
 """Cosine between surface and line of sight; flatter than that means a step."""
-_BLOCK = 400_000
-"""Points compared at a time."""
 _SAMPLE_STEP = 4
 _MIN_SAMPLES = 2000
 _GATE_PX = 2.0
@@ -50,14 +48,24 @@ class Placed:
     known less well."""
     calibration: Plane
     """(H, W) standard deviation from the calibration, metres; zero if it has none."""
-    normals: NDArray[np.float32] | None = None
-    """(H, W, 3) in the camera, towards it; None: of the points."""
+    normals: NDArray[np.float32]
+    """(H, W, 3) in the camera, towards it; NaN at steps and borders."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """Which points are kept."""
+
+    min_views: int
+    """Depth maps that have to agree, this one included."""
+    keep_single: bool
+    """Whether to keep what no other depth map sees at all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FuseCounts:
     num_points: int
-    """Of the depth map."""
+    """Measured by the depth map, in these rows."""
     num_confirmed: int
     num_contradicted: int
     """More depth maps see something else there than agree."""
@@ -114,9 +122,8 @@ def fuse(
     others: list[Placed],
     image: NDArray[np.uint8],
     noise: float,
-    *,
-    min_views: int,
-    keep_single: bool,
+    rule: Rule,
+    rows: slice = slice(None),
 ) -> tuple[Fused, FuseCounts]:
     """The points of a depth map that others confirm, and what they agree upon.
 
@@ -125,78 +132,38 @@ def fuse(
         others: its neighbours.
         image: (H, W, 3) of the view, blue, green, red.
         noise: standard deviation of a disparity, pixels.
-        min_views: depth maps that have to agree, this one included.
-        keep_single: whether to keep what no other depth map sees at all.
+        rule: what is kept.
+        rows: of the depth map; memory grows with them.
     """
-    normals = normals_of(view) if view.normals is None else view.normals
-    keep = np.isfinite(view.distance) & np.isfinite(normals[..., 0])
-    where = np.flatnonzero(keep)
-    parts, totals = [], np.zeros(3, dtype=np.int64)
-    for first in range(0, len(where), _BLOCK):
-        block = where[first : first + _BLOCK]
-        part, counts = _fused(
-            view, others, image, normals, block, noise, (min_views, keep_single)
-        )
-        parts.append(part)
-        totals += counts
-    names = Fused.__dataclass_fields__
-    if not parts:
-        parts = [_empty()]
-    joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
-    confirmed, contradicted, unchecked = (int(total) for total in totals)
-    return Fused(**joined), FuseCounts(
-        num_points=int(np.count_nonzero(np.isfinite(view.distance))),
-        num_confirmed=confirmed,
-        num_contradicted=contradicted,
-        num_unchecked=unchecked,
-    )
-
-
-def _fused(
-    view: Placed,
-    others: list[Placed],
-    image: NDArray[np.uint8],
-    all_normals: NDArray[np.float32],
-    block: NDArray[np.int64],
-    noise: float,
-    rule: tuple[int, bool],
-) -> tuple[Fused, NDArray[np.int64]]:
-    """Some of the pixels of a depth map."""
-    min_views, keep_single = rule
+    some = np.zeros(view.distance.shape, dtype=bool)
+    some[rows] = np.isfinite(view.distance[rows])
+    block = np.flatnonzero(some & np.isfinite(view.normals[..., 0]))
     world_from_cam = rigid3.inverse(view.cam_from_world)
     in_cam = view.points.reshape(-1, 3)[block].astype(np.float64)
     sensitivity = view.sensitivity.ravel()[block].astype(np.float64)
     points = rigid3.transform(world_from_cam, in_cam)
     normals = rigid3.rotate(
-        world_from_cam, all_normals.reshape(-1, 3)[block].astype(np.float64)
+        world_from_cam, view.normals.reshape(-1, 3)[block].astype(np.float64)
     )
     sight = points - world_from_cam[4:]
     distance = np.linalg.norm(sight, axis=1)
     sight /= distance[:, None]
     slant = np.einsum("ni,ni->n", normals, sight)
     weight = sensitivity**-2.0
-    moved, num_views = np.zeros(len(points)), np.ones(len(points), dtype=np.int64)
-    num_against = np.zeros(len(points), dtype=np.int64)
-    seen_by_others = np.zeros(len(points), dtype=bool)
+    verdicts = _Verdicts(len(points))
     for other in others:
         told = _told(other, points)
         # A step along the other's sight moves the surface; along ours by this much.
         turn = np.einsum("ni,ni->n", normals, told.sight) / slant
         turn = np.clip(turn, 1.0 / 3.0, 3.0)
-        step, spread = told.difference * turn, told.sensitivity * turn
-        both = noise * np.hypot(sensitivity, spread)
-        seen_by_others |= np.isfinite(step)
-        with np.errstate(invalid="ignore"):
-            agrees = np.abs(step) <= AGREE_STDDEVS * both
-            num_against += ~agrees & (step > -HIDDEN_STDDEVS * both)
-        w = spread[agrees] ** -2.0
-        moved[agrees] += w * step[agrees]
-        weight[agrees] += w
-        num_views[agrees] += 1
-    points += (moved / weight)[:, None] * sight
-    contradicted = num_against >= num_views
-    confirmed = (num_views >= min_views) & ~contradicted
-    keep = confirmed | ~seen_by_others if keep_single else confirmed
+        verdicts.hear(
+            noise, sensitivity, told.difference * turn, told.sensitivity * turn
+        )
+    weight = sensitivity**-2.0 + verdicts.weight
+    points += (verdicts.moved / weight)[:, None] * sight
+    contradicted = verdicts.num_against >= verdicts.num_views
+    confirmed = (verdicts.num_views >= rule.min_views) & ~contradicted
+    keep = confirmed | ~verdicts.seen if rule.keep_single else confirmed
     kept = block[keep]
     systematic = view.calibration.ravel()[kept]
     fused = Fused(
@@ -204,20 +171,59 @@ def _fused(
         normals=normals[keep],
         colors=image.reshape(-1, 3)[kept][:, ::-1],
         stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
-        num_views=num_views[keep],
+        num_views=verdicts.num_views[keep],
         view_range=distance[keep],
     )
-    counts = [confirmed, contradicted, ~confirmed & ~contradicted]
-    return fused, np.array([np.count_nonzero(mask) for mask in counts])
+    return fused, FuseCounts(
+        num_points=int(np.count_nonzero(some)),
+        num_confirmed=int(np.count_nonzero(confirmed)),
+        num_contradicted=int(np.count_nonzero(contradicted)),
+        num_unchecked=int(np.count_nonzero(~confirmed & ~contradicted)),
+    )
 
 
-def normals_of(view: Placed) -> NDArray[np.float32]:
-    """Normals (H, W, 3) in the camera, towards it; NaN at steps and borders."""
-    across, down = (_differences(view.points, axis) for axis in (1, 0))
+class _Verdicts:
+    """What other depth maps say of points (N,)."""
+
+    def __init__(self, count: int) -> None:
+        self.moved, self.weight = np.zeros(count), np.zeros(count)
+        self.num_views = np.ones(count, dtype=np.int64)
+        self.num_against = np.zeros(count, dtype=np.int64)
+        self.seen = np.zeros(count, dtype=bool)
+        """By any other."""
+
+    def hear(self, noise: float, own: Array, step: Array, spread: Array) -> None:
+        """One of them.
+
+        Args:
+            noise: standard deviation of a disparity, pixels.
+            own: (N,) metres per pixel of disparity.
+            step: (N,) how much farther it has the surface; NaN where it has none.
+            spread: (N,) its metres per pixel.
+        """
+        both = noise * np.hypot(own, spread)
+        self.seen |= np.isfinite(step)
+        with np.errstate(invalid="ignore"):
+            agrees = np.abs(step) <= AGREE_STDDEVS * both
+            self.num_against += ~agrees & (step > -HIDDEN_STDDEVS * both)
+        w = spread[agrees] ** -2.0
+        self.moved[agrees] += w * step[agrees]
+        self.weight[agrees] += w
+        self.num_views[agrees] += 1
+
+
+def normals_of(points: NDArray[np.float32], distance: Plane) -> NDArray[np.float32]:
+    """Normals (H, W, 3) in the camera, towards it; NaN at steps and borders.
+
+    Args:
+        points: (H, W, 3) in the camera.
+        distance: (H, W) of them.
+    """
+    across, down = (_differences(points, axis) for axis in (1, 0))
     normals = np.cross(across, down)
     with np.errstate(invalid="ignore", divide="ignore"):
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        slant = np.einsum("yxi,yxi->yx", normals, view.points) / view.distance
+        slant = np.einsum("yxi,yxi->yx", normals, points) / distance
         normals *= -np.sign(slant)[..., None]
         normals[~(np.abs(slant) > _MAX_SLANT)] = np.nan
     return normals
@@ -241,9 +247,9 @@ def _told(other: Placed, points: Array) -> _Told:
     in_cam = rigid3.transform(other.cam_from_world, points)
     xy, valid = other.camera.img_from_point(in_cam)
     distance = np.linalg.norm(in_cam, axis=1)
-    sensitivity = _looked_up(other.sensitivity, xy, nearest=True)
-    seen = _looked_up(other.distance, xy)
-    nearest = _looked_up(other.distance, xy, nearest=True)
+    sensitivity = looked_up(other.sensitivity, xy, nearest=True).astype(np.float64)
+    seen = looked_up(other.distance, xy).astype(np.float64)
+    nearest = looked_up(other.distance, xy, nearest=True)
     with np.errstate(invalid="ignore"):
         # Between two surfaces there is none.
         seen[~(np.abs(seen - nearest) < sensitivity) | ~valid] = np.nan
@@ -253,43 +259,23 @@ def _told(other: Placed, points: Array) -> _Told:
     return _Told(difference=seen - distance, sensitivity=sensitivity, sight=sight)
 
 
-def _looked_up(plane: Plane, xy: Array, nearest: bool = False) -> Array:
-    """Values (N,) at pixels (N, 2); NaN outside and beside NaN."""
-    # cv2.remap wants its positions as an image of limited width: fold them.
-    height = -(-len(xy) // FOLD)
-    at = np.full((height * FOLD, 2), -10.0, dtype=np.float32)
-    at[: len(xy)] = np.nan_to_num(xy - 0.5, nan=-10.0, posinf=-10.0, neginf=-10.0)
-    values = sampled(
-        plane, np.clip(at, -10.0, 1e6).reshape(height, FOLD, 2), nearest=nearest
-    )
-    return values.reshape(-1)[: len(xy)].astype(np.float64)
-
-
-def _empty() -> Fused:
-    return Fused(
-        points=np.empty((0, 3)),
-        normals=np.empty((0, 3)),
-        colors=np.empty((0, 3), dtype=np.uint8),
-        stddev=np.empty(0),
-        num_views=np.empty(0, dtype=np.int64),
-        view_range=np.empty(0),
-    )
-
-
 def placed(
     camera: RefractiveCamera, cam_from_world: Array, depth: DepthMap, calibration: Plane
 ) -> Placed:
     """A depth map with its points."""
     origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
-    points = origins + depth.ranges.reshape(-1, 1) * dirs
     shape = depth.ranges.shape
+    exact = (origins + depth.ranges.reshape(-1, 1) * dirs).reshape(*shape, 3)
+    points = exact.astype(np.float32)
+    distance = np.linalg.norm(exact, axis=2).astype(np.float32)
+    normals = depth.normals
     alike = depth.spread is None
     return Placed(
         camera=camera,
         cam_from_world=cam_from_world,
-        points=points.astype(np.float32).reshape(*shape, 3),
-        distance=np.linalg.norm(points, axis=1).astype(np.float32).reshape(shape),
+        points=points,
+        distance=distance,
         sensitivity=depth.sensitivity if alike else depth.sensitivity * depth.spread,
         calibration=calibration,
-        normals=depth.normals,
+        normals=normals_of(points, distance) if normals is None else normals,
     )

@@ -6,12 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
+from uwsfm.dense.exposure import SeenColors
 from uwsfm.dense.fuse import Placed, placed
+from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.options import MAX_PIXELS, MAX_STEREO_PIXELS, DenseOptions
 from uwsfm.dense.patchmatch_maps import PatchMatchMaps
 from uwsfm.dense.stereo_maps import StereoMaps
@@ -131,6 +134,15 @@ class DepthMaps:
         """The image of a depth map (H, W, 3), blue, green, red."""
         view = self.views[index]
         return self._maker.color(view.camera, view.name)
+
+    def point_colors(self, index: int) -> SeenColors:
+        """What the image of a depth map shows around the points of the model."""
+        view, scene = self.views[index], self.model.scene
+        at = (scene.camera_idx == view.camera) & (scene.frame_idx == view.frame)
+        xy = scene.xy[at] / self._maker.factor(view.camera)
+        image = cv2.blur(self.color(index), (3, 3))
+        colors = looked_up(image, xy, cv2.BORDER_REPLICATE).astype(np.float32)
+        return SeenColors(rows=scene.point_idx[at], colors=colors)
 
     @property
     def num_passes(self) -> int:

@@ -13,8 +13,9 @@ from uwsfm.errors import InputError
 
 PLACED_BYTES = 40
 """Per pixel of a depth map in memory, with its points and normals."""
-FUSE_BYTES = 450
-"""Per pixel while its map is fused, beside the maps it is compared with, about."""
+FUSE_BYTES, FUSE_PIXELS = 450, 100_000
+"""Per pixel while it is fused, beside the maps it is compared with, about; and pixels
+that are fused at once."""
 STORE_SHARE, FUSE_SHARE = 0.25, 0.25
 """Of the memory, for depth maps that are kept and for those being fused; the rest is
 for voxels."""
@@ -66,6 +67,18 @@ class Load:
     """Depth maps that each one is compared with."""
 
 
+def fused_bytes(pixels: int, compared: int) -> float:
+    """What it takes to fuse a depth map, a band at a time.
+
+    Args:
+        pixels: of it.
+        compared: depth maps that it is compared with.
+    """
+    return (
+        FUSE_BYTES * min(pixels, FUSE_PIXELS) + PLACED_BYTES * (1 + compared) * pixels
+    )
+
+
 def plan(load: Load, max_memory: float, used: float, threads: int) -> Plan:
     """Share out what there is.
 
@@ -81,7 +94,7 @@ def plan(load: Load, max_memory: float, used: float, threads: int) -> Plan:
     room = max_memory - used
     largest = max(load.pixels)
     compared = min(load.neighbours, len(load.pixels) - 1)
-    fuse = largest * (FUSE_BYTES + PLACED_BYTES * (1 + compared))
+    fuse = fused_bytes(largest, compared)
     needed = max(load.map_bytes, fuse / (1.0 - STORE_SHARE))
     if room < needed:
         raise InputError(

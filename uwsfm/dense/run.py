@@ -6,28 +6,32 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from uwsfm._disk import explained, require_room
 from uwsfm._files import require_writable
 from uwsfm._partial import remove_stale
 from uwsfm._progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
-from uwsfm.dense.fuse import FuseCounts, Placed, fuse, noise_px, robust_stddev
+from uwsfm.dense.exposure import balancing_gains
+from uwsfm.dense.fuse import FuseCounts, Placed, Rule, fuse, noise_px, robust_stddev
 from uwsfm.dense.maps import DepthMaps
 from uwsfm.dense.options import ASSUMED_NOISE_PX, DenseOptions
-from uwsfm.dense.plan import PLACED_BYTES, Load, Plan, plan
+from uwsfm.dense.plan import FUSE_PIXELS, PLACED_BYTES, Load, Plan, plan
 from uwsfm.dense.views import neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.summary import write_json
+from uwsfm.geometry.rigid3 import Array
 from uwsfm.job_log import job_log
 from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
 
@@ -287,33 +291,59 @@ class _Run:
         middle = np.nanmedian(scene.points, axis=0)
         voxels = Voxels(voxel, middle, self.plan.voxel_bytes)
         totals = np.zeros(4, dtype=np.int64)
-        count, ahead = len(self.views), self.plan.fusers
+        ahead = self.plan.fusers
+        gains = balancing_gains(
+            [self.maps.point_colors(index) for index in range(len(self.views))]
+        )
+        self.color = lru_cache(ahead + 1)(lambda index: self._balanced(index, gains))
         with ThreadPoolExecutor(ahead) as pool:
             # In order, so that runs repeat to the last digit; a few ahead, since what
             # is finished waits in memory.
-            jobs: deque[Future] = deque()
-            for index in range(count + ahead):
-                if index < count:
-                    jobs.append(pool.submit(self._fuse_one, index, noise))
-                if index < ahead:
-                    continue
-                fused, counts = jobs.popleft().result()
-                voxels.add(fused)
-                totals += list(asdict(counts).values())
-                self.progress("fusion", index + 1 - ahead, count)
+            jobs: deque[tuple[int, Future]] = deque()
+            for index, rows in self._bands():
+                jobs.append((index, pool.submit(self._fuse_one, index, rows, noise)))
+                if len(jobs) > ahead:
+                    self._add(voxels, totals, *jobs.popleft())
+            while jobs:
+                self._add(voxels, totals, *jobs.popleft())
         names = ("num_measured", "num_confirmed", "num_contradicted", "num_unchecked")
         self.store.clear()
         cloud = voxels.cloud()
         return dict(zip(names, totals.tolist(), strict=True)), cloud, voxels.size
 
-    def _fuse_one(self, index: int, noise: float) -> tuple[Fused, FuseCounts]:
+    def _bands(self) -> Iterator[tuple[int, slice]]:
+        """Views and some rows of them, so many that their memory is bounded."""
+        for index, view in enumerate(self.views):
+            camera = self.maps.camera(view)
+            count = max(1, FUSE_PIXELS // camera.width)
+            for top in range(0, camera.height, count):
+                yield index, slice(top, top + count)
+
+    def _add(
+        self, voxels: Voxels, totals: NDArray[np.int64], index: int, job: Future
+    ) -> None:
+        fused, counts = job.result()
+        voxels.add(fused)
+        totals += list(asdict(counts).values())
+        self.progress("fusion", index + 1, len(self.views))
+
+    def _balanced(self, index: int, gains: Array) -> NDArray[np.uint8]:
+        """The image of a view as all of them were exposed."""
+        image = self.maps.color(index) * gains[index].astype(np.float32)
+        return np.rint(np.clip(image, 0.0, 255.0)).astype(np.uint8)
+
+    def _fuse_one(
+        self, index: int, rows: slice, noise: float
+    ) -> tuple[Fused, FuseCounts]:
         return fuse(
             self.store.get(index),
             [self.store.get(i) for i in self.near[index]],
-            self.maps.color(index),
+            self.color(index),
             noise,
-            min_views=self.options.min_views,
-            keep_single=self.options.keep_single,
+            Rule(
+                min_views=self.options.min_views, keep_single=self.options.keep_single
+            ),
+            rows,
         )
 
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from uwsfm._packages import import_package
 from uwsfm._progress import Progress, silent
 from uwsfm.colmap import Model
-from uwsfm.dense.fuse import FOLD
+from uwsfm.dense.exposure import SeenColors, balancing_gains
+from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.views import load_image
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -32,9 +33,6 @@ _HIDDEN_SHARE = 4e-3
 itself by less."""
 _NUM_SAMPLED = 20_000
 """Texels that tell how bright images are, beside each other."""
-_GAIN_ROUNDS = 10
-_DARK = 8.0
-"""Of 255: darker colours say little of an exposure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +91,12 @@ def make_texture(
     rng = np.random.default_rng(0)
     count = len(atlas.texel)
     some = np.sort(rng.permutation(count)[:_NUM_SAMPLED])
-    gains = _gains(list(photographs.sights(atlas, some, progress, "balancing images")))
+    gains = balancing_gains(
+        [
+            SeenColors(rows=sight.rows, colors=sight.colors)
+            for sight in photographs.sights(atlas, some, progress, "balancing images")
+        ]
+    )
     total = np.zeros((count, 3), dtype=np.float32)
     weight = np.zeros(count, dtype=np.float32)
     for sight in photographs.sights(atlas, np.arange(count), progress, "texture"):
@@ -169,7 +172,7 @@ class _Photographs:
         return _Sight(
             image=index,
             rows=rows[good],
-            colors=_sampled(image, xy[good]),
+            colors=looked_up(image, xy[good], cv2.BORDER_REPLICATE).astype(np.float32),
             weights=weights[good].astype(np.float32),
         )
 
@@ -204,48 +207,6 @@ def _border_distance(lens: RefractiveCamera, xy: Array) -> Array:
     """Pixels (n,) from the middle of the outermost pixels inwards."""
     far = np.array([lens.width, lens.height]) - 0.5
     return np.minimum(xy - 0.5, far - xy).min(axis=1)
-
-
-def _sampled(image: NDArray[np.uint8], xy: Array) -> NDArray[np.float32]:
-    """Colours (n, 3) between pixels."""
-    count = len(xy)
-    if not count:
-        return np.empty((0, 3), dtype=np.float32)
-    # cv2.remap wants its positions as an image of limited width: fold them.
-    height = -(-count // FOLD)
-    at = np.zeros((height * FOLD, 2), dtype=np.float32)
-    at[:count] = xy - 0.5
-    x, y = np.moveaxis(at.reshape(height, FOLD, 2), 2, 0)
-    found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return found.reshape(-1, 3)[:count].astype(np.float32)
-
-
-def _gains(sights: list[_Sight]) -> NDArray[np.float64]:
-    """(I, 3) what colours of each image are multiplied by; their geometric mean is one.
-
-    Medians of log ratios to what all images see of the same texels: a shadow or a
-    highlight of one of them is an outlier.
-    """
-    count = 1 + max((int(s.rows.max()) for s in sights if len(s.rows)), default=0)
-    logs = np.zeros((len(sights), 3))
-    for _ in range(_GAIN_ROUNDS):
-        total, number = np.zeros((count, 3)), np.zeros(count)
-        for sight in sights:
-            total[sight.rows] += _log(sight.colors) + logs[sight.image]
-            number[sight.rows] += 1.0
-        shared = number > 1.0
-        mean = total / np.maximum(number, 1.0)[:, None]
-        for sight in sights:
-            some = shared[sight.rows] & (sight.colors.min(axis=1) > _DARK)
-            if np.any(some):
-                ratio = mean[sight.rows[some]] - _log(sight.colors[some])
-                logs[sight.image] = np.median(ratio, axis=0)
-        logs -= logs.mean(axis=0)
-    return np.exp(logs)
-
-
-def _log(colors: NDArray[np.float32]) -> Array:
-    return np.log(np.maximum(colors.astype(np.float64), 1.0))
 
 
 def _picture(atlas: Atlas, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
