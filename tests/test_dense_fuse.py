@@ -113,6 +113,24 @@ def test_what_others_contradict_is_dropped(rng: np.random.Generator):
     assert len(nothing) == 0
 
 
+def test_colours_beside_a_step_and_from_aside_and_afar_count_little(rng):
+    """A step of 30 cm in a floor: its pixels show the colours of both sides."""
+    maps = maps_of_floor(rng, 4, bump=0.3)
+    image = np.zeros((60, 80, 3), dtype=np.uint8)
+    rule = Rule(min_views=1, keep_single=True)
+    fused, _ = fuse(maps[3], [], image, NOISE_PX, rule)
+    weight = np.full(image.shape[:2], np.nan)
+    weight[np.isfinite(maps[3].distance) & np.isfinite(maps[3].normals[..., 0])] = (
+        fused.color_weight
+    )
+    # Beside the step, but not a few pixels away from it on either side.
+    assert np.nanmax(weight[18:22, 24:36]) < 0.01 * np.nanmin(weight[27:33, 27:33])
+    assert np.nanmin(weight[10:15, 25:35]) > 100.0 * np.nanmax(weight[18:22, 24:36])
+    # Of the floor in the middle, the square of cosine over distance.
+    expected = 1.0 / maps[3].distance[30, 60] ** 2
+    assert weight[30, 60] == pytest.approx(expected, rel=0.15)
+
+
 def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
     count = 500
     # A real survey's coordinates: single precision has 3 cm there.
@@ -125,6 +143,7 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         stddev=rng.uniform(0.001, 0.002, count),
         num_views=rng.integers(2, 9, count),
         view_range=rng.uniform(1.0, 2.0, count),
+        color_weight=rng.uniform(0.1, 3.0, count),
     )
     voxels = Voxels(0.05, origin, 1e9)
     for part in np.array_split(np.arange(count), 7):
@@ -140,8 +159,10 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         i = int(np.argmin(np.linalg.norm(cloud.points - mean, axis=1)))
         # Double precision at 5000 km is a nanometre, and the oracle sums there.
         np.testing.assert_allclose(cloud.points[i], mean, rtol=0.0, atol=1e-8)
-        nearest = rows[np.argmin(fused.view_range[rows])]
-        np.testing.assert_array_equal(cloud.colors[i], fused.colors[nearest])
+        color = np.average(fused.colors[rows], axis=0, weights=fused.color_weight[rows])
+        # Rounded, from sums in single precision.
+        np.testing.assert_allclose(cloud.colors[i], color, rtol=0.0, atol=0.501)
+        assert cloud.view_range[i] == np.float32(fused.view_range[rows].min())
         assert cloud.num_views[i] == fused.num_views[rows].max()
         # Neighbours share their errors: the mean's deviation is the mean deviation,
         # no smaller for being of many.
@@ -162,6 +183,7 @@ def test_voxels_that_do_not_fit_become_larger(rng: np.random.Generator):
         stddev=np.full(count, 0.001),
         num_views=np.full(count, 3),
         view_range=np.full(count, 1.5),
+        color_weight=np.ones(count),
     )
     voxels = Voxels(0.001, np.zeros(3), 300.0 * BYTES_PER_VOXEL)
     voxels.add(fused)

@@ -4,8 +4,9 @@
 
 OUT is that of pipeline.py, after ``uwsfm dense OUT``; DATA is the photographs' folder,
 if it is no longer where it was. Prints the share of each view's pixels (at half size)
-where the cloud has a point, and writes ``dense.jpg`` into OUT: the photographs above,
-the cloud below. ``--cloud`` looks at another cloud in the same frame.
+where the cloud has a point and the mean colours of photograph and cloud there, and
+writes ``dense.jpg`` into OUT: the photographs above, the cloud below. ``--cloud`` looks
+at another cloud in the same frame.
 """
 
 import argparse
@@ -42,11 +43,16 @@ def seen_from(model: Model, cloud: uwsfm.Cloud, frame: int) -> np.ndarray:
     return image
 
 
-def covered(model: Model, cloud: uwsfm.Cloud, frame: int) -> float:
-    """Share of a view's pixels that have a point."""
+def covered(model: Model, cloud: uwsfm.Cloud, frame: int) -> np.ndarray:
+    """Which of a view's pixels (h, w) have a point."""
     marked = cloud.select(np.ones(len(cloud), dtype=bool))
     marked.colors[:] = 0
-    return float(np.mean(np.all(seen_from(model, marked, frame) == 0, axis=2)))
+    return np.all(seen_from(model, marked, frame) == 0, axis=2)
+
+
+def _mean_color(image: np.ndarray, where: np.ndarray) -> str:
+    """Red, green, blue."""
+    return ", ".join(f"{level:.0f}" for level in image[where].mean(axis=0)[::-1])
 
 
 def main() -> None:
@@ -60,14 +66,19 @@ def main() -> None:
     result = uwsfm.open_result(options.out, options.images)
     model, folder = result.model, result.require_images()
     cloud = uwsfm.read_cloud(options.cloud or options.out / "dense" / "cloud.ply")
-    print("| photograph | pixels with a point |\n|---|---|")
+    print(
+        "| photograph | pixels with a point | red, green, blue there | of the cloud |"
+    )
+    print("|---|---|---|---|")
     columns = []
     for view in VIEWS:
         (frame,) = (k for k, name in enumerate(model.frame_names) if view in name)
-        print(f"| {view} | {covered(model, cloud, frame):.0%} |")
         photograph = cv2.imread(str(folder / model.image_name(0, frame)))
         image = seen_from(model, cloud, frame)
         small = cv2.resize(photograph, image.shape[1::-1], interpolation=cv2.INTER_AREA)
+        filled = covered(model, cloud, frame)
+        both = (_mean_color(picture, filled) for picture in (small, image))
+        print(f"| {view} | {filled.mean():.0%} | {' | '.join(both)} |")
         columns.append(np.vstack([small, image]))
     cv2.imwrite(str(options.out / "dense.jpg"), np.hstack(columns))
 

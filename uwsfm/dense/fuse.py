@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,9 @@ AGREE_STDDEVS = 3.0
 HIDDEN_STDDEVS = 15.0
 """A surface that is nearer to another camera by more than this hides the point, and
 says nothing about it."""
+EDGE_PX, EDGE_STEP, EDGE_SHARE = 3, 0.05, 1e-3
+"""A step in range by more than this share within so many pixels is an edge; colours
+beside it count so much."""
 _NORMAL_REACH = 2
 """Pixels on each side whose points give the normal."""
 _MAX_SLANT = 0.15
@@ -173,6 +177,7 @@ def fuse(
         stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
         num_views=verdicts.num_views[keep],
         view_range=distance[keep],
+        color_weight=(slant**2 * distance**-2.0)[keep] * _color_shares(view, kept),
     )
     return fused, FuseCounts(
         num_points=int(np.count_nonzero(some)),
@@ -180,6 +185,19 @@ def fuse(
         num_contradicted=int(np.count_nonzero(contradicted)),
         num_unchecked=int(np.count_nonzero(~confirmed & ~contradicted)),
     )
+
+
+def _color_shares(view: Placed, pixels: NDArray[np.int64]) -> Array:
+    """How much the colours of pixels (n,) count: little beside a step, whose colour is
+    often that of the other surface."""
+    box = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8)
+    nothing = ~np.isfinite(view.distance)
+    far = cv2.dilate(np.where(nothing, -np.inf, view.distance), box)
+    near = cv2.erode(np.where(nothing, np.inf, view.distance), box)
+    with np.errstate(invalid="ignore", over="ignore"):
+        step = far - near > EDGE_STEP * near
+    step |= cv2.dilate(nothing.astype(np.uint8), box) > 0
+    return np.where(step.ravel()[pixels], EDGE_SHARE, 1.0)
 
 
 class _Verdicts:

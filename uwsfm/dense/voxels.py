@@ -18,7 +18,7 @@ from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
-BYTES_PER_VOXEL = 190
+BYTES_PER_VOXEL = 205
 """Where all become a cloud and its file, about."""
 COARSER = 2.0**0.5
 """Of a side, so that half of the voxels of a surface remain."""
@@ -37,6 +37,9 @@ class Fused:
     stddev: Array
     num_views: NDArray[np.int64]
     view_range: Array
+    color_weight: Array
+    """(N,) how well the image shows the colour: less at an edge, where it is mixed with
+    that of another surface, from aside and from afar."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -74,8 +77,10 @@ class Voxels:
         rows["position"] = weight[:, None] * local
         rows["normal"] = np.nan_to_num(weight[:, None] * fused.normals)
         rows["stddev"] = weight * fused.stddev
-        for name in ("colors", "num_views", "view_range"):
+        for name in ("num_views", "view_range"):
             rows[name] = getattr(fused, name)
+        rows["color_weight"] = fused.color_weight
+        rows["color"] = fused.color_weight[:, None] * fused.colors
         self._pending.append(_merged(rows))
         if sum(map(len, self._pending)) > _PENDING:
             self._flush()
@@ -130,8 +135,10 @@ class Voxels:
                 cloud.normals[to] = np.where(length > 0.0, normals / length, np.nan)
             cloud.points[to] = rows["position"] / weight + self._origin
             cloud.stddev[to] = rows["stddev"] / rows["weight"]
-            for name in ("colors", "num_views", "view_range"):
+            for name in ("num_views", "view_range"):
                 getattr(cloud, name)[to] = rows[name]
+            mean = rows["color"] / rows["color_weight"][:, None]
+            cloud.colors[to] = np.rint(mean).astype(np.uint8)
         return cloud
 
 
@@ -142,7 +149,8 @@ _ROW = np.dtype(
         ("position", "<f8", 3),
         ("normal", "<f4", 3),
         ("stddev", "<f8"),
-        ("colors", "u1", 3),
+        ("color", "<f4", 3),
+        ("color_weight", "<f4"),
         ("num_views", "<i4"),
         ("view_range", "<f4"),
     ]
@@ -161,7 +169,7 @@ def _room_for(count: int) -> Cloud:
 
 
 def _merged(rows: np.ndarray) -> np.ndarray:
-    """One row per key: sums, the most views, and the colour of the nearest view."""
+    """One row per key: sums, the most views, and the nearest range."""
     if not len(rows):
         return rows
     order = np.lexsort((rows["view_range"], rows["key"]))
@@ -169,7 +177,7 @@ def _merged(rows: np.ndarray) -> np.ndarray:
     key = rows["key"]
     starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
     merged = rows[starts]
-    for name in ("weight", "position", "normal", "stddev"):
+    for name in ("weight", "position", "normal", "stddev", "color", "color_weight"):
         merged[name] = np.add.reduceat(rows[name], starts, axis=0)
     merged["num_views"] = np.maximum.reduceat(rows["num_views"], starts)
     return merged
