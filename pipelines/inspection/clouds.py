@@ -50,6 +50,8 @@ CELL_SHARE = 0.5
 """Side of the cells in which points count once, of the smallest tolerance."""
 HIDDEN_M = 0.005
 """What a ray hits so much before a place hides it."""
+MATCHERS = ("stereo", "patchmatch")
+"""Of a rig, all; of one camera the last."""
 SPECS = {"reef": reef_spec, "near": near_spec}
 ONE = "one"
 """Suffix of a scene of which the left camera alone is used."""
@@ -248,9 +250,11 @@ def main() -> None:
     rows = []
     for name, spec, result, images in results(options.out, options.only):
         surface = surface_of(spec, 1 if name.endswith(ONE) else 2)
-        cloud = dense(result, images)
-        points = placed(cloud.points, model_centers(uwsfm.read_model(result)), spec)
-        rows.append(scored(points, surface).row(name, "uwsfm dense"))
+        centers = model_centers(uwsfm.read_model(result))
+        for matcher in MATCHERS[1 if name.endswith(ONE) else 0 :]:
+            cloud = dense(result, images, matcher=matcher)
+            points = placed(cloud.points, centers, spec)
+            rows.append(scored(points, surface).row(name, f"uwsfm, {matcher}"))
         for label, scene, path, sparse in options.also:
             if scene == name:
                 other = uwsfm.read_cloud(path).points
