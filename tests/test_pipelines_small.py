@@ -258,7 +258,8 @@ def test_inspection_of_whole_clouds(tmp_path):
     rows = table(run("inspection/clouds.py", *arguments, change=change), "scene")
     assert [row[0] for row in rows] == ["reef one"]
     for row in rows:
-        assert 0.0 < number(row[3]) <= 100.0 and number(row[-2]) > 5.0
+        assert 0.0 < number(row[3]) <= 100.0 and number(row[-3]) > 5.0
+        assert 0.2 < number(row[-1]) < 5.0
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,9 @@ and its near dive, as a stereo rig and as the left camera alone. ``--also`` scor
 another program's cloud (a PLY) of the same images; SPARSE is its COLMAP model, whose
 image centres place the cloud, with a scale, on the truth; ours is placed in the same
 way. Tolerances are for a metre: they grow with the distance from the nearest camera.
+*Off / sd*: median distance from the surface over the deviation that the cloud gives
+each point, of what normal errors would have: one where it is right, less where sights
+meet the surface at a slant.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from pipeline import dense, reconstructed
 from reef import floor_of, reef_spec
 from scipy.spatial import cKDTree
@@ -29,7 +33,7 @@ from uwsfm.colmap import Model
 from uwsfm.console import ProgressBars
 from uwsfm.dense.depth_map import pixel_rows
 from uwsfm.geometry import rigid3
-from uwsfm.geometry.alignment import align
+from uwsfm.geometry.alignment import Similarity, align
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig_file import dump_rig, load_rig
 from uwsfm.simulate.rigs import known_cam_from_rig
@@ -42,6 +46,8 @@ from uwsfm.simulate.sequence import (
 
 TOLERANCES_MM = (1.0, 2.0, 5.0)
 """At a metre from the nearest camera."""
+NORMAL_MEDIAN = 0.6745
+"""Of the absolute value of a normal variable, in standard deviations."""
 STEP = 2
 """Of the pixels whose rays sample the surface."""
 MIN_VIEWS = 2
@@ -77,12 +83,16 @@ class Scores:
     num_points: int
     accuracy: tuple[float, ...]
     completeness: tuple[float, ...]
+    off_over_stddev: float | None
+    """Median, of its expectation; None: the cloud has no deviations."""
 
     def row(self, scene: str, name: str) -> str:
         cells = []
         for a, c in zip(self.accuracy, self.completeness, strict=True):
             f1 = 2.0 * a * c / max(a + c, 1e-12)
             cells.append(f"{1e2 * a:.1f} | {1e2 * c:.1f} | **{1e2 * f1:.1f}**")
+        ratio = self.off_over_stddev
+        cells.append("-" if ratio is None else f"{ratio:.2f}")
         return f"| {scene} | {name} | {self.num_points} | {' | '.join(cells)} |"
 
 
@@ -111,7 +121,8 @@ def surface_of(spec: SequenceSpec, cameras: int) -> Surface:
         for each, (_, pose) in zip(found, poses, strict=True)
     )
     cell = CELL_SHARE * 1e-3 * TOLERANCES_MM[0] * nearest
-    places = thinned(np.concatenate(found), cell)
+    sampled = np.concatenate(found)
+    places = sampled[thinned(sampled, cell)]
     views, reach = np.zeros(len(places)), np.full(len(places), np.inf)
     for lens, pose in poses:
         seen, distance = _seen(floor, lens, pose, places)
@@ -144,18 +155,23 @@ def _distances_to(floor) -> Any:
     ).numpy()
 
 
-def thinned(points: Array, cell: float) -> Array:
+def thinned(points: Array, cell: float) -> NDArray[np.int64]:
     """One point of each cell: dense parts of a cloud count no more than thin ones."""
     _, first = np.unique(
         np.floor(points / cell).astype(np.int64), axis=0, return_index=True
     )
-    return points[np.sort(first)]
+    return np.sort(first)
 
 
-def scored(points: Array, surface: Surface) -> Scores:
-    """Scores of a cloud (N, 3) in the world of the truth."""
-    points = thinned(points[np.isfinite(points).all(axis=1)], surface.cell)
+def scored(points: Array, stddev: Array | None, surface: Surface) -> Scores:
+    """Scores of a cloud (N, 3), deviations (N,), in the world of the truth."""
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    rows = known[thinned(points[known], surface.cell)]
+    points = points[rows]
     off = surface.floor(points)
+    ratio = None
+    if stddev is not None:
+        ratio = float(np.median(off / stddev[rows]) / NORMAL_MEDIAN)
     _, nearest = cKDTree(surface.places).query(points, workers=-1)
     gap, _ = cKDTree(points).query(surface.places, workers=-1)
     limits = [1e-3 * t for t in TOLERANCES_MM]
@@ -165,11 +181,12 @@ def scored(points: Array, surface: Surface) -> Scores:
             float(np.mean(off <= t * surface.reach[nearest])) for t in limits
         ),
         completeness=tuple(float(np.mean(gap <= t * surface.reach)) for t in limits),
+        off_over_stddev=ratio,
     )
 
 
-def placed(points: Array, centers: dict[str, Array], spec: SequenceSpec) -> Array:
-    """Points (N, 3) of a model in the world of the truth, by its image centres."""
+def placement(centers: dict[str, Array], spec: SequenceSpec) -> Similarity:
+    """Of a model in the world of the truth, by its image centres."""
     names = [camera.name for camera in spec.rig.cameras]
     poses = known_cam_from_rig(spec.rig)
     true = {
@@ -181,7 +198,7 @@ def placed(points: Array, centers: dict[str, Array], spec: SequenceSpec) -> Arra
     }
     common = sorted(set(true) & set(centers))
     x, y = (np.array([place[name] for name in common]) for place in (centers, true))
-    return align(x, y, np.ones(len(common)), with_scale=True).apply(points)
+    return align(x, y, np.ones(len(common)), with_scale=True)
 
 
 def model_centers(model: Model) -> dict[str, Array]:
@@ -253,16 +270,18 @@ def main() -> None:
         centers = model_centers(uwsfm.read_model(result))
         for matcher in MATCHERS[1 if name.endswith(ONE) else 0 :]:
             cloud = dense(result, images, matcher=matcher)
-            points = placed(cloud.points, centers, spec)
-            rows.append(scored(points, surface).row(name, f"uwsfm, {matcher}"))
+            place = placement(centers, spec)
+            known = place.apply(cloud.points), place.scale * cloud.stddev
+            rows.append(scored(*known, surface).row(name, f"uwsfm, {matcher}"))
         for label, scene, path, sparse in options.also:
             if scene == name:
                 other = uwsfm.read_cloud(path).points
-                points = placed(other, colmap_centers(Path(sparse)), spec)
-                rows.append(scored(points, surface).row(name, label))
+                place = placement(colmap_centers(Path(sparse)), spec)
+                points = place.apply(other)
+                rows.append(scored(points, None, surface).row(name, label))
     head = [f"accuracy | completeness | F1 at {t:g} mm" for t in TOLERANCES_MM]
-    print(f"| scene | cloud of | points | {' | '.join(head)} |")
-    print("|---" * (3 + 3 * len(TOLERANCES_MM)) + "|")
+    print(f"| scene | cloud of | points | {' | '.join(head)} | off / sd |")
+    print("|---" * (4 + 3 * len(TOLERANCES_MM)) + "|")
     print("\n".join(rows))
 
 

@@ -7,6 +7,7 @@ workspace, so that a run that was stopped goes on.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,10 @@ from uwsfm.sfm.steps import fingerprint
 
 FORMAT = 3
 """Of the hypotheses and of what is made of them: others are made again."""
+
+
+KEPT_IMAGES = 16
+"""Grey images in memory."""
 
 
 class PatchMatchMaps:
@@ -63,6 +68,8 @@ class PatchMatchMaps:
         self._views = views
         self._reduced = Reduced(model, images, max_pixels)
         self.camera, self.factor = self._reduced.camera, self._reduced.factor
+        # Neighbours are needed again and again, and large images take long to read.
+        self._gray = lru_cache(KEPT_IMAGES)(self._gray_of)
         self._index = {(view.camera, view.frame): i for i, view in enumerate(views)}
 
     def name(self, view: View) -> str:
@@ -125,7 +132,9 @@ class PatchMatchMaps:
         view = self._views[index]
         full = self._model.scene.cameras[view.camera]
         images = 4.0 * full.width * full.height  # one at a time, read and grey
-        return images + patchmatch_bytes(self.camera(view.camera), len(view.others))
+        small = self.camera(view.camera)
+        images += KEPT_IMAGES * small.width * small.height
+        return images + patchmatch_bytes(small, len(view.others))
 
     def _patchmatch(
         self, index: int, planes: list[Hypotheses] | None = None
@@ -151,7 +160,7 @@ class PatchMatchMaps:
             seed=index,
         )
 
-    def _gray(self, camera: int, name: str) -> NDArray[Any]:
+    def _gray_of(self, camera: int, name: str) -> NDArray[Any]:
         return cv2.cvtColor(self.color(camera, name), cv2.COLOR_BGR2GRAY)
 
     def _points(self, index: int) -> Array:

@@ -19,7 +19,7 @@ that are fused at once."""
 STORE_SHARE, FUSE_SHARE = 0.25, 0.25
 """Of the memory, for depth maps that are kept and for those being fused; the rest is
 for voxels."""
-MONO_SECONDS, STEREO_SECONDS, FUSE_SECONDS = 26.0, 4.0, 6.0
+MONO_SECONDS, STEREO_SECONDS, FUSE_SECONDS = 19.0, 4.0, 3.0
 """Of one core, per megapixel of a depth map, about: what is told before it begins."""
 
 
