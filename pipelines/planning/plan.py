@@ -146,7 +146,7 @@ def print_given(noise_px: float) -> None:
     print("\n| if this is wrong | by | tilt, deg | port distance, mm | lengths, % |")
     print("|---|---|---|---|---|")
     for row in budget:
-        one = row.name.endswith((" of left", " of right"))
+        one = " of camera" in row.name
         if one and not row.name.startswith("baseline"):
             continue  # the row of both cameras alike is there, too
         tilt = max(shift.tilt_deg for shift in row.shifts)
