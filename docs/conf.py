@@ -24,10 +24,11 @@ extensions = [
 ]
 exclude_patterns = ["_ext", "notebooks/README.md"]
 source_suffix = {".md": "markdown"}
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 html_math_renderer = "mathtext"
 default_role = "py:obj"
+smartquotes_action = "qe"
 
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"

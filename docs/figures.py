@@ -79,7 +79,7 @@ def refraction() -> None:
 
 ROWS = (
     ("command line", "cli · console"),
-    ("whole jobs", "pipeline · refine_pipeline · housing_pipeline · batch · check"),
+    ("whole jobs", "pipeline · refine_pipeline · batch · check"),
     ("from a result", "report · dense · surface · color · measuring · export"),
     ("verdict", "trust"),
     ("images to map", "sfm · colmap · simulate · rig_file"),

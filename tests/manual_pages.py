@@ -38,6 +38,7 @@ class Page:
     sections: tuple[str, ...]
     """From one heading to the next, as they are written."""
     headings: tuple[str, ...]
+    table_rows: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -67,6 +68,7 @@ def page(path: Path) -> Page:
         prose=tuple(_paragraphs(rest)),
         sections=tuple(sections),
         headings=tuple(headings),
+        table_rows=tuple(line for line in rest if line.startswith("|")),
     )
 
 
@@ -110,7 +112,7 @@ def _paragraphs(lines: list[str]) -> list[str]:
         if (not line.strip() or starts or line.startswith("|")) and current:
             found.append(" ".join(current))
             current = []
-        if line.strip() and not line.startswith(("|", "{{", "![")):
+        if line.strip() and not line.startswith(("|", "{{", "{.", "![")):
             current.append(_BULLET.sub("", line).strip("# >").strip())
     return [paragraph for paragraph in found if paragraph]
 

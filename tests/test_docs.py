@@ -154,7 +154,7 @@ def test_the_readme_is_short_and_keeps_its_two_commands():
 
 @EACH
 def test_words(page):
-    prose = "\n".join(page.prose)
+    prose = "\n".join([*page.prose, *page.table_rows])
     banned = BANNED if page.name.endswith("glossary.md") else BANNED + GLOSSARY_ONLY
     text = plain(prose).replace("SIMD lanes", "")
     for pattern in banned:

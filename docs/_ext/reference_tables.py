@@ -45,11 +45,22 @@ PAGES_OF_API = {
 }
 
 
-def table(header: list[str], rows: list[list[str]]) -> str:
+ORDER = (
+    *("init", "demo", "reconstruct", "calibrate", "refine", "check", "view", "report"),
+    *("measure", "dense", "clean", "mesh", "map", "color", "export", "batch"),
+)
+"""Of the commands on their page; others follow."""
+
+
+def table(header: list[str], rows: list[list[str]], kind: str = "") -> str:
+    """A table in Markdown; its kind is a class of manual.css."""
+
     def line(cells: list[str]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
-    return "\n".join([line(header), line(["---"] * len(header)), *map(line, rows)])
+    rule = line(["---"] * len(header))
+    marks = [f"{{.{kind}}}"] if kind else []
+    return "\n".join([*marks, line(header), rule, *map(line, rows)])
 
 
 def options() -> str:
@@ -57,7 +68,9 @@ def options() -> str:
     tree = dict(commands())
     general = tree.pop("")
     parts = ["## Before the command\n", _command_table(general)]
-    for name, command in tree.items():
+    names = [name for name in ORDER if name in tree]
+    for name in dict.fromkeys([*names, *tree]):
+        command = tree[name]
         arguments = [p for p in command.parameters if p.is_argument]
         usage = " ".join(
             f"<{p.names[0].lower()}>" if p.required else f"[{p.names[0].lower()}]"
@@ -77,9 +90,11 @@ def _command_table(command: Command) -> str:
     for parameter in command.parameters:
         names = ", ".join(f"`{name}`" for name in parameter.names)
         kind = parameter.kind + (", may be repeated" if parameter.repeated else "")
-        default = "required" if parameter.required else parameter.default
-        rows.append([names, kind, default, parameter.help])
-    return table(["name", "value", "default", "meaning"], rows) + "\n"
+        kind += ", **required**" if parameter.required else ""
+        words = re.sub(r"(?<![\w`])(--[a-z][\w=-]*)", r"`\1`", parameter.help)
+        rows.append([names, kind, parameter.default, words])
+    header = ["name", "value", "default", "meaning"]
+    return table(header, rows, "options") + "\n"
 
 
 def rig_file() -> str:
@@ -148,28 +163,26 @@ def _type_of(hint: Any) -> str:
 
 
 def _bounds(metadata: tuple[Any, ...]) -> str:
-    found = []
+    limits: dict[str, Any] = {}
     for item in metadata:
         for bound in getattr(item, "metadata", [item]):
             if isinstance(bound, BaseMetadata):
-                found += [_bound(bound)]
-    text = ", ".join(part for part in found if part)
-    return f" ({text})" if text else ""
+                limits |= {k: getattr(bound, k) for k in _LIMITS if hasattr(bound, k)}
+    least, most = limits.get("min_length"), limits.get("max_length")
+    if least is not None and least == most:
+        return f" (exactly {least})"
+    words = [_LIMITS[key].format(f"{value:.7g}") for key, value in limits.items()]
+    return f" ({', '.join(words)})" if words else ""
 
 
-def _bound(bound: BaseMetadata) -> str:
-    words = {
-        "gt": "above {}",
-        "ge": "at least {}",
-        "lt": "below {}",
-        "le": "at most {}",
-        "min_length": "{} or more",
-        "max_length": "{} at most",
-    }
-    for name, text in words.items():
-        if hasattr(bound, name):
-            return text.format(getattr(bound, name))
-    return ""
+_LIMITS = {
+    "gt": "above {}",
+    "ge": "at least {}",
+    "lt": "below {}",
+    "le": "at most {}",
+    "min_length": "{} or more",
+    "max_length": "{} at most",
+}
 
 
 def accuracy_limits() -> str:
@@ -195,7 +208,7 @@ def accuracy_defaults() -> str:
         values = ", ".join(f"{getattr(given_accuracy, name):g}" for name in names)
         why = " ".join(ast.literal_eval(after.value).split())
         rows.append([", ".join(f"`{name}`" for name in names), values, why])
-    return table(["default", "value", "reason"], rows)
+    return table(["default", "value", "reason"], rows, "sentences")
 
 
 def yaml_files() -> str:
