@@ -22,7 +22,7 @@ extensions = [
     "notebook_pages",
     "reference_tables",
 ]
-exclude_patterns = ["_ext", "notebooks/README.md"]
+exclude_patterns = ["_build", "_ext"]
 source_suffix = {".md": "markdown"}
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4

@@ -267,6 +267,26 @@ def test_notebooks_run(path, tmp_path):
     client(notebook, timeout=300, resources=resources).execute()
 
 
+@pytest.mark.slow
+def test_the_planning_page_has_what_its_command_prints():
+    """To a unit of the last digit: another processor may round otherwise."""
+    script = ROOT / "pipelines" / "planning" / "plan.py"
+    found = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr
+    written = BY_NAME["docs/planning.md"].path.read_text(encoding="utf-8")
+    printed = [rows for text in found.stdout.split("\n\n") for rows in tables(text)]
+    shown = {row[0]: row for rows in tables(written) for row in rows}
+    assert len(printed) == 7
+    for row in (row for rows in printed for row in rows):
+        page_row = shown[row[0]]
+        numbers = zip(row[-3:], page_row[-3:], strict=True)
+        assert all(
+            np.isclose(float(a), float(b), rtol=0.02, atol=0.01) for a, b in numbers
+        ), (row, page_row)
+
+
 def test_notebooks_are_small():
     assert len(NOTEBOOKS) == 3
     for path in NOTEBOOKS:
