@@ -3,6 +3,7 @@
 They are kept in docs/images, so that a build of the manual needs no drawing.
 """
 
+import re
 from pathlib import Path
 
 import matplotlib
@@ -113,13 +114,13 @@ def architecture() -> None:
 
 
 def save(figure: plt.Figure, name: str) -> None:
-    IMAGES.mkdir(exist_ok=True)
+    """Write an SVG with a line per group: matplotlib writes one per vertex."""
+    path = IMAGES / f"{name}.svg"
     figure.savefig(
-        IMAGES / f"{name}.svg",
-        bbox_inches="tight",
-        facecolor="white",
-        metadata={"Date": None},
+        path, bbox_inches="tight", facecolor="white", metadata={"Date": None}
     )
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r"\s*\n\s*(?!\s*<g )", " ", text).strip() + "\n", "utf-8")
     plt.close(figure)
 
 
