@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import textwrap
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -264,22 +263,23 @@ def test_calibrate_names_the_mistake(tmp_path, options, words):
     assert {path.name for path in tmp_path.iterdir()} == {"rig.yaml"}
 
 
-def test_simulated_observations_calibrate_back_as_the_readme_says(
+def test_simulated_observations_calibrate_back_as_the_manual_shows(
     tmp_path, monkeypatch, capsys
 ):
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    (command,) = re.findall(r"`uwsfm (simulate observations -o [^`]*)`", readme)
+    manual = Path(__file__).parents[1] / "docs" / "howto" / "python.md"
+    page = manual.read_text(encoding="utf-8")
+    (command,) = re.findall(
+        r"^uwsfm (simulate observations -o .*)$", page, re.MULTILINE
+    )
     found = run(*command.split(), cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     monkeypatch.chdir(tmp_path)
-    blocks = re.split(r"\n(?=\S)", readme)
-    (example,) = (
-        textwrap.dedent(b[b.index("\n") :]) for b in blocks if "perturbed" in b
-    )
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (example,) = (block for block in blocks if "perturbed" in block)
     names: dict[str, Any] = {}
     exec(example, names)
-    scene, truth = names["found"].scene, names["dive"].truth
-    cameras = names["found"].covariance.cameras
+    scene, truth = names["result"].scene, names["dive"].truth
+    cameras = names["result"].covariance.cameras
     for port, true, known in zip(scene.ports, truth.ports, cameras, strict=True):
         miss = abs(port.distance - true.distance)
         # It started 10 mm off; 0.2 mm is what this dive determines.
