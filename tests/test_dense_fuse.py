@@ -131,6 +131,22 @@ def test_colours_beside_a_step_and_from_aside_and_afar_count_little(rng):
     assert weight[30, 60] == pytest.approx(expected, rel=0.15)
 
 
+def test_bands_of_rows_give_what_the_whole_map_gives(rng: np.random.Generator):
+    maps = maps_of_floor(rng, 4, bump=0.3)
+    image = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    rule = Rule(min_views=2, keep_single=False)
+    whole, counts = fuse(maps[3], maps[:3], image, NOISE_PX, rule)
+    bands = [
+        fuse(maps[3], maps[:3], image, NOISE_PX, rule, slice(top, top + 17))
+        for top in range(0, 60, 17)
+    ]
+    for name, expected in vars(whole).items():
+        joined = np.concatenate([getattr(band, name) for band, _ in bands])
+        np.testing.assert_array_equal(joined, expected, err_msg=name)
+    for name, expected in vars(counts).items():
+        assert sum(getattr(count, name) for _, count in bands) == expected
+
+
 def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
     count = 500
     # A real survey's coordinates: single precision has 3 cm there.

@@ -139,9 +139,10 @@ def fuse(
         rule: what is kept.
         rows: of the depth map; memory grows with them.
     """
-    some = np.zeros(view.distance.shape, dtype=bool)
-    some[rows] = np.isfinite(view.distance[rows])
-    block = np.flatnonzero(some & np.isfinite(view.normals[..., 0]))
+    top, bottom, _ = rows.indices(view.distance.shape[0])
+    measured = np.isfinite(view.distance[top:bottom])
+    block = np.flatnonzero(measured & np.isfinite(view.normals[top:bottom, :, 0]))
+    block += top * view.distance.shape[1]
     world_from_cam = rigid3.inverse(view.cam_from_world)
     in_cam = view.points.reshape(-1, 3)[block].astype(np.float64)
     sensitivity = view.sensitivity.ravel()[block].astype(np.float64)
@@ -177,27 +178,38 @@ def fuse(
         stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
         num_views=verdicts.num_views[keep],
         view_range=distance[keep],
-        color_weight=(slant**2 * distance**-2.0)[keep] * _color_shares(view, kept),
+        color_weight=(slant**2 * distance**-2.0)[keep]
+        * _color_shares(view.distance, kept, top, bottom),
     )
     return fused, FuseCounts(
-        num_points=int(np.count_nonzero(some)),
+        num_points=int(np.count_nonzero(measured)),
         num_confirmed=int(np.count_nonzero(confirmed)),
         num_contradicted=int(np.count_nonzero(contradicted)),
         num_unchecked=int(np.count_nonzero(~confirmed & ~contradicted)),
     )
 
 
-def _color_shares(view: Placed, pixels: NDArray[np.int64]) -> Array:
+def _color_shares(
+    distance: Plane, pixels: NDArray[np.int64], top: int, bottom: int
+) -> Array:
     """How much the colours of pixels (n,) count: little beside a step, whose colour is
-    often that of the other surface."""
+    often that of the other surface.
+
+    Args:
+        distance: (H, W)
+        pixels: in rows top to bottom - 1.
+        top, bottom: those rows.
+    """
+    first = max(top - EDGE_PX, 0)
+    around = distance[first : bottom + EDGE_PX]
     box = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=np.uint8)
-    nothing = ~np.isfinite(view.distance)
-    far = cv2.dilate(np.where(nothing, -np.inf, view.distance), box)
-    near = cv2.erode(np.where(nothing, np.inf, view.distance), box)
+    nothing = ~np.isfinite(around)
+    far = cv2.dilate(np.where(nothing, -np.inf, around), box)
+    near = cv2.erode(np.where(nothing, np.inf, around), box)
     with np.errstate(invalid="ignore", over="ignore"):
         step = far - near > EDGE_STEP * near
     step |= cv2.dilate(nothing.astype(np.uint8), box) > 0
-    return np.where(step.ravel()[pixels], EDGE_SHARE, 1.0)
+    return np.where(step.ravel()[pixels - first * distance.shape[1]], EDGE_SHARE, 1.0)
 
 
 class _Verdicts:
