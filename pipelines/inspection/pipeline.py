@@ -39,6 +39,8 @@ def reconstructed(rig: Path, images: Path, out: Path) -> None:
 def dense(out: Path, images: Path, **options) -> uwsfm.Cloud:
     """The cloud; how long it took and what memory, if every depth map was made."""
     start, before = time.monotonic(), time.process_time()
+    # The truth of the dives before is in this process, too.
+    options = {"max_memory": 4e9, **options}
     with ProgressBars() as progress:
         result = uwsfm.dense_cloud(out, images, progress=progress, **options)
     summary = result.summary
