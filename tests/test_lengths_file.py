@@ -22,8 +22,9 @@ from test_outside import (
 
 import uwsfm
 from uwsfm import InputError
+from uwsfm._options import option_named
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.cli_options import lever_arm_of
+from uwsfm.cli_options import vector_of
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
@@ -276,7 +277,7 @@ def test_unknown_names_are_refused_before_anything_is_written(mono, tmp_path, rn
     one_sentence(done, "'0000.png' is not among the images", "'0000.jpg'")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="--lever-arm 1,2: write three numbers"):
-        lever_arm_of("1,2")
+        vector_of(option_named(uwsfm.ReconstructOptions, "lever_arm"), "1,2")
     with pytest.raises(InputError, match=r"^--lever-arm .* no effect without"):
         KnownLengths.read(None, None, [1.0, 2.0, 3.0])
 
