@@ -61,7 +61,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _global_options(
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show what uwsfm.log receives, too.")
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Show on the terminal what uwsfm.log receives."
+        ),
     ] = False,
     debug: Annotated[
         bool,
@@ -72,7 +75,7 @@ def _global_options(
         typer.Option(
             "--version",
             "-V",
-            help="Print the version.",
+            help="Print the version of uwsfm, and end.",
             is_eager=True,
             callback=_print_version,
         ),
@@ -86,13 +89,15 @@ def _global_options(
 
 @app.command(rich_help_panel=START)
 def init(
-    rig_file: Annotated[Path, typer.Argument(help="File to write.")] = Path("rig.yaml"),
+    rig_file: Annotated[Path, typer.Argument(help="The rig file to write.")] = Path(
+        "rig.yaml"
+    ),
     source: Annotated[
         Path | None,
         typer.Option(
             "--from",
-            help="cameras.txt of Refractive COLMAP, or its text model: lenses, ports "
-            "and placement from there.",
+            help="Where lenses, ports and placement are copied from: cameras.txt of "
+            "Refractive COLMAP, or its text model. Default: a commented template.",
             show_default=False,
         ),
     ] = None,

@@ -21,40 +21,43 @@ def dense(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The images' folder, if they were moved.", show_default=False
+            help="Folder where the images are now. Default: where they were.",
+            show_default=False,
         ),
     ] = None,
     voxel: Annotated[
         float | None,
         typer.Option(
             help="Side of the voxels that points are merged in, in the unit of the "
-            "model; by default the footprint of a pixel.",
+            "model. Default: the footprint of a pixel.",
             show_default=False,
         ),
     ] = None,
     min_views: Annotated[
-        int, typer.Option(min=1, help="Depth maps that have to agree on a point.")
+        int,
+        typer.Option(min=1, help="Number of depth maps that have to agree on a point."),
     ] = 2,
     keep_single: Annotated[
-        bool, typer.Option(help="Keep also what one depth map alone sees.")
+        bool, typer.Option(help="Keep the points that only one depth map sees, too.")
     ] = False,
     noise_px: Annotated[
         float | None,
         typer.Option(
-            help="Standard deviation of a disparity; by default from the differences "
-            "between depth maps.",
+            help="Standard deviation of a disparity, in pixels. Default: estimated "
+            "from the differences between depth maps.",
             show_default=False,
         ),
     ] = None,
     quality: Annotated[
         str,
         typer.Option(
-            help="high, medium or low: how far one camera's images are reduced; pairs "
-            "are compared as they are."
+            help="Size to which one camera's images are reduced: high, medium or low. "
+            "Stereo pairs are compared as they are."
         ),
     ] = "medium",
     max_memory: Annotated[
-        str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
+        str,
+        typer.Option(help="Most memory of the whole process, as 2GB or 800MB."),
     ] = "2GB",
     threads: ThreadsOption = -1,
 ) -> None:

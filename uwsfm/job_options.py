@@ -74,9 +74,8 @@ class AdjustmentOptions(Checked):
         {},
         metavar="KEY=VALUE",
         keys=PRIORS,
-        help="Standard deviation of a refined number as it is known before: "
-        "distance_stddev_m, normal_stddev_deg, center_stddev_m, water_index_stddev, "
-        "focal_stddev (relative), principal_point_stddev_px, distortion_stddev. May be "
+        help="Standard deviation of a refined number as it is known before: KEY is "
+        f"one of {', '.join(PRIORS)}. focal_stddev is relative: 0.001 is 0.1 %. May be "
         "repeated. Default: nothing is known.",
     )
     further: Mapping[str, Any] = field(default_factory=dict)

@@ -178,7 +178,8 @@ class StartOptions(Checked):
         help="Which mapper finds the poses that the last adjustment starts from. "
         "refractive: traces water rays in every step, so that near scenes and tilted "
         "ports fit from the beginning. pinhole: COLMAP's mapper with pinholes fitted "
-        "to the ports; water rays enter in the last adjustment only.",
+        "to the ports; water rays enter in the last adjustment only. calibrate begins "
+        "with pinhole, as the 2011 paper does; reconstruct begins with refractive.",
     )
     seed: int = option(
         0,
@@ -192,8 +193,7 @@ class StartOptions(Checked):
         flag="--threads",
         minimum=-1,
         per_dive=False,
-        help="Number of threads, and of processes that map submaps. -1: one for each "
-        "core.",
+        help="Number of threads or processes that work at once. -1: one for each core.",
     )
     scheduler: str = option(
         LOCAL,
