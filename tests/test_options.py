@@ -171,7 +171,7 @@ def refused(tmp_path, text: str) -> str:
     [
         ("thread: 3", "thread: unknown key, did you mean num_threads?"),
         ("max-features: 3000", "max-features: unknown key, did you mean max_features?"),
-        ("xyz: 1", "xyz: unknown key; the keys here are out, positions, lever"),
+        ("xyz: 1", "xyz: unknown key, known are out, positions, lever_arm, le"),
         ("seed: [1, 2]", "seed: must be one value, not [1, 2]"),
         ("refine: focal", "refine: must be a list, not 'focal'"),
         ("prior: 3", "prior: must be a block of keys, not 3"),
@@ -240,7 +240,7 @@ def test_python_may_name_options_groups_and_fields_of_the_adjustment():
     assert both.adjustment.refine == ("focal",)
     assert both.adjustment.prior == {"focal_stddev": 1e-3}
     assert both.adjustment.further == {"max_iterations": 3}
-    assert both.adjustment.fields() == {
+    assert both.adjustment.as_fields() == {
         "refine_focal": True,
         "focal_stddev": 1e-3,
         "max_iterations": 3,
@@ -248,14 +248,29 @@ def test_python_may_name_options_groups_and_fields_of_the_adjustment():
     assert both.with_settings({"refine_focal": False}).adjustment.refine == ()
     assert both.with_settings({"focal_stddev": None}).adjustment.prior == {}
     one_camera = ReconstructOptions.of(refine_focal=(True, False))
-    assert one_camera.adjustment.fields() == {"refine_focal": (True, False)}
-    with pytest.raises(InputError, match="no_such_option"):
-        uwsfm.reconstruct(
-            Path(__file__).parents[1] / "datasets" / "sample" / "rig.yaml",
-            "images",
-            "out",
-            no_such_option=1,
-        )
+    assert one_camera.adjustment.as_fields() == {"refine_focal": (True, False)}
+    for name, words in (("mapperr", "mapper"), ("max_iteration", "max_iterations")):
+        with pytest.raises(
+            InputError, match=rf"unknown option {name}, did you mean {words}\?"
+        ):
+            uwsfm.reconstruct("rig.yaml", "images", "out", **{name: 1})
+    with pytest.raises(InputError, match="lever_arm must be three numbers, got 3"):
+        ReconstructOptions.of(lever_arm=3)
+
+
+def test_python_shows_the_options_and_what_they_do():
+    for kind in JOBS.values():
+        for item in options_of(kind):
+            assert f"    {item.name} ({item.default!r}): " in kind.__doc__
+
+
+def test_a_result_has_the_options_that_it_was_made_with(dive_result):
+    data = yaml.safe_load((dive_result.out / OPTIONS).read_text())
+    options = RefineOptions.of(**data)
+    assert options.constraints.lengths is not None
+    program, command, *words = shlex.split(dive_result.result.summary["command"])
+    assert (program, command) == ("uwsfm", "refine")
+    assert "--lengths" in words and str(options.constraints.lengths) in words
 
 
 @pytest.mark.parametrize(
@@ -293,5 +308,5 @@ def test_defaults_are_the_same_wherever_a_job_is_started():
     own = CalibrateHousingOptions().front_end
     assert own == replace(StartOptions(), mapper="pinhole")
     for job in JOBS:
-        assert "mapper" not in JOBS[job]().adjustment.fields()
+        assert "mapper" not in JOBS[job]().adjustment.as_fields()
     assert MatchOptions().matcher == "colmap"

@@ -14,9 +14,11 @@ a declaration may have, each with None or without:
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
+import textwrap
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -26,6 +28,7 @@ from uwsfm.errors import InputError
 _OPTION, _GROUP = "option", "group"
 
 Options = TypeVar("Options")
+Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +126,12 @@ class Option:
         if given is None:
             return None
         if self.is_vector:
-            return tuple(float(number) for number in given)
+            try:
+                return tuple(float(number) for number in given)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"{self.label} must be three numbers, got {given!r}"
+                ) from None
         return Path(given) if self.type is Path else given
 
     def texts(self, value: Any) -> list[str]:
@@ -214,6 +222,27 @@ def options_of(kind: type) -> tuple[Option, ...]:
 def option_named(kind: type, name: str) -> Option:
     """One of `options_of`."""
     return next(item for item in options_of(kind) if item.name == name)
+
+
+def unknown(name: str, known: Sequence[str]) -> str:
+    """What to say of a name that no option has: the one that was meant, or all."""
+    close = difflib.get_close_matches(name.lower().replace("-", "_"), known, n=1)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"known are {', '.join(known)}"
+
+
+def documented(kind: type[Kind]) -> type[Kind]:
+    """Add all options of a dataclass to its docstring, for those who use Python."""
+    lines = [kind.__doc__ or "", "", "Options by name, with their defaults:", ""]
+    wrapper = textwrap.TextWrapper(
+        88, initial_indent=4 * " ", subsequent_indent=8 * " "
+    )
+    for item in options_of(kind):
+        text = f"{item.name} ({item.default!r}): {item.declared.help}"
+        lines.append(wrapper.fill(text))
+    kind.__doc__ = "\n".join(lines)
+    return kind
 
 
 def group_names(kind: type) -> tuple[str, ...]:

@@ -109,7 +109,7 @@ def calibrate_housing(
         progress=progress,
     )
     # A wrong option fails before anything is written.
-    require_effect(CalibrateOptions.parsed(job.adjusted))
+    require_effect(job.adjusted)
     require_elsewhere(out, source)
     _require_place(job.source, output_folder(out, made_of=made_of))
     model = find_model(job.source)
@@ -160,7 +160,7 @@ class _Job:
             **rig_options(self.rig),
             "strategy": self.options.strategy,
             "error": self.options.error,
-            **self.options.adjustment.fields(),
+            **self.options.adjustment.as_fields(),
         }
 
     def from_images(self) -> "_Job":

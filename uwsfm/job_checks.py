@@ -1,8 +1,9 @@
 """What a job checks before it reads an image: the rig, and options without effect."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -71,8 +72,16 @@ def at_scene_distance(options: FromImages, rig: Rig) -> FromImages:
     return replace(options, front_end=front_end)
 
 
-def require_effect(options: CalibrateOptions) -> None:
-    """Refuse what is known of a number that is not refined."""
+def require_effect(fields: Mapping[str, Any]) -> None:
+    """Refuse what is known of a number that is not refined.
+
+    Args:
+        fields: of `CalibrateOptions`, by name.
+
+    Raises:
+        InputError: one has no effect, or `CalibrateOptions` refuses it.
+    """
+    options = CalibrateOptions.parsed(dict(fields))
     refined = {
         "distance_stddev_m": ("the distance of a port", options.refine_distances),
         "normal_stddev_deg": ("the normal of a port", options.refine_normals),

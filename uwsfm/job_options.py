@@ -6,22 +6,25 @@ way from images to a map. Whatever else knows of it is derived, see `uwsfm._opti
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from uwsfm._options import (
     Checked,
     Option,
+    documented,
     group,
     group_names,
     option,
     options_of,
     replaced,
+    unknown,
     value_at,
 )
 from uwsfm.calibration.choices import PRIORS, ErrorName, Refinable, Strategy
+from uwsfm.errors import InputError
 from uwsfm.sfm.options import StartOptions
 
 Start = Literal["virtual", "paper", "pairs"]
@@ -81,7 +84,7 @@ class AdjustmentOptions(Checked):
     further: Mapping[str, Any] = field(default_factory=dict)
     """Other fields of `CalibrateOptions`, by name: for Python only."""
 
-    def fields(self) -> dict[str, Any]:
+    def as_fields(self) -> dict[str, Any]:
         """All of this as fields of `CalibrateOptions`."""
         refined = {f"refine_{name.replace('-', '_')}": True for name in self.refine}
         return {**refined, **self.prior, **self.further}
@@ -107,22 +110,24 @@ class JobOptions(Checked):
                 fields of `CalibrateOptions` for the adjustment.
 
         Raises:
-            InputError: a value is out of bounds.
+            InputError: a value is out of bounds, or a name is unknown.
         """
         declared = {item.name: item for item in options_of(type(self))}
         whole: dict[tuple[str, ...], Any] = {}
         own: dict[tuple[str, ...], Any] = {}
-        fields = {}
+        rest = {}
         for name, value in settings.items():
             if name in group_names(type(self)):
                 whole[name,] = value
             elif name in declared:
                 own[declared[name].path] = value
             else:
-                fields[name] = value
+                rest[name] = value
         # A group first, then what is given of it beside.
         options = replaced(replaced(self, whole), own)
-        adjustment = _with_fields(options.adjustment, fields)
+        if rest:
+            _require_known(rest, list(declared))
+        adjustment = _with_fields(options.adjustment, rest)
         return replaced(options, {("adjustment",): adjustment})
 
     def items(self) -> Iterator[tuple[Option, Any]]:
@@ -143,6 +148,7 @@ class ModelOptions(JobOptions):
     report: bool = option(True, help="Write report.html, which takes a second or two.")
 
 
+@documented
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions(ModelOptions):
     """Options of `uwsfm.reconstruct`, and of `uwsfm reconstruct`."""
@@ -150,6 +156,7 @@ class ReconstructOptions(ModelOptions):
     front_end: StartOptions = group(StartOptions)
 
 
+@documented
 @dataclass(frozen=True, kw_only=True)
 class RefineOptions(ModelOptions):
     """Options of `uwsfm.refine_model`, and of `uwsfm refine`."""
@@ -167,6 +174,7 @@ class RefineOptions(ModelOptions):
     )
 
 
+@documented
 @dataclass(frozen=True, kw_only=True)
 class CalibrateHousingOptions(JobOptions):
     """Options of `uwsfm.calibrate_housing`, and of `uwsfm calibrate`."""
@@ -191,8 +199,18 @@ class CalibrateHousingOptions(JobOptions):
     front_end: StartOptions = group(lambda: StartOptions(mapper="pinhole"))
 
 
+def _require_known(names: Iterable[str], options: list[str]) -> None:
+    """Refuse a name that neither an option nor a field of `CalibrateOptions` has."""
+    from uwsfm.calibration.problem import CalibrateOptions  # heavy, and for Python only
+
+    known = options + [field.name for field in fields(CalibrateOptions)]
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown option {name}, {unknown(name, known)}")
+
+
 def _with_fields(
-    options: AdjustmentOptions, fields: Mapping[str, Any]
+    options: AdjustmentOptions, given: Mapping[str, Any]
 ) -> AdjustmentOptions:
     """Options of an adjustment with some fields of `CalibrateOptions`.
 
@@ -202,7 +220,7 @@ def _with_fields(
     refine, prior = dict.fromkeys(options.refine), dict(options.prior)
     further = dict(options.further)
     names = {f"refine_{name.replace('-', '_')}": name for name in get_args(Refinable)}
-    for name, value in fields.items():
+    for name, value in given.items():
         if name in names and isinstance(value, bool):
             further.pop(name, None)
             refine.pop(names[name], None)

@@ -6,14 +6,13 @@ relative to the working folder, as on the command line.
 
 from __future__ import annotations
 
-import difflib
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from uwsfm._files import replaced_file
-from uwsfm._options import Option
+from uwsfm._options import Option, unknown
 from uwsfm.errors import InputError
 from uwsfm.job_options import JobOptions
 
@@ -62,7 +61,8 @@ def read_typed(
     found: dict[str, str | list[str]] = {}
     for key, value in data.items():
         if key not in known:
-            raise InputError(f"{path}: {key}: {_unknown(str(key), list(known))}")
+            meant = unknown(str(key), list(known))
+            raise InputError(f"{path}: {key}: unknown key, {meant}")
         if value is None:
             continue
         try:
@@ -85,13 +85,6 @@ def _typed(item: Option | None, value: Any) -> str | list[str]:
     if isinstance(value, (list, Mapping)):
         raise ValueError(f"must be one value, not {shown}")
     return str(value) if item is None else item.texts(value)[0]
-
-
-def _unknown(key: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(key.lower().replace("-", "_"), known, n=1)
-    if close:
-        return f"unknown key, did you mean {close[0]}?"
-    return f"unknown key; the keys here are {', '.join(known)}"
 
 
 def _plain(value: Any) -> Any:

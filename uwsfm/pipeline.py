@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.export.files import (
     HOUSING,
@@ -101,11 +101,10 @@ def reconstruct(
     command = command_line("reconstruct", (rig, images), out, options)
     asked = {"rig": rig, "images": images, "out": out, **options.values()}
     rig_source, rig = rig, checked_rig(rig)
-    calibration, known = options.adjustment.fields(), options.constraints
-    require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
+    require_effect({**rig_options(rig), **options.adjustment.as_fields()})
     made_of = made_of_files(rig_source, images)
     out = output_folder(out, images, made_of)
-    options = at_scene_distance(options, rig)
+    options, known = at_scene_distance(options, rig), options.constraints
     # Wrong folders and files fail before anything is written.
     options.front_end.features.require_masks()
     frames = find_frames(Path(images), rig)
@@ -206,7 +205,7 @@ class _Job:
             self.progress,
             known=known,
             lengths=lengths,
-            **self.options.adjustment.fields(),
+            **self.options.adjustment.as_fields(),
         )
 
 

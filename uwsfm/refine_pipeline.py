@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.export.files import HOUSING, POINTS, RIG_GIVEN, SPARSE, export_colmap
@@ -38,11 +38,7 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
 from uwsfm.sfm.colors import point_colors
-from uwsfm.sfm.model_database import (
-    ImageDatabase,
-    read_image_database,
-    with_database,
-)
+from uwsfm.sfm.model_database import ImageDatabase, read_image_database, with_database
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.pixels import image_fault
@@ -116,28 +112,12 @@ def refine_model(
     command = command_line("refine", (source, rig), out, options)
     asked = {"source": source, "rig": rig, "out": out, **options.values()}
     rig_source, rig = rig, checked_rig(rig)
-    calibration, known = options.adjustment.fields(), options.constraints
-    require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
-    distance_m = scene_distance(rig, known.scene_distance_m)
+    require_effect({**rig_options(rig), **options.adjustment.as_fields()})
     made_of = made_of_files(rig_source, source)
     require_elsewhere(out, source)
     source, out = Path(source), output_folder(out, options.images, made_of)
-    model = _found(source)
-    if out.exists() and _same_or_inside(model.folder, out / SPARSE):
-        raise InputError(
-            f"{out / SPARSE} holds the model that is to be refined, which the result "
-            "would replace: choose another folder"
-        )
     clock = time.perf_counter()
-    start = start_from_model(model, rig, distance_m, options.database)
-    if options.images is not None:
-        _check_images(options.images, rig, start)
-    matches = None
-    if options.database is not None:
-        matches = read_image_database(options.database, start.model, rig)
-    lengths = KnownLengths.read(known.lengths, known.positions, known.lever_arm)
-    names = start.model.frame_names if matches is None else matches.frame_names
-    lengths.check_names(rig, names)
+    start, matches, lengths = _inputs(source, rig, out, options)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out), job_log(out, command, asked, progress) as log:
         job = _Job(
@@ -155,6 +135,30 @@ def refine_model(
         result = job.run()
         log.result(result.summary)
         return result
+
+
+def _inputs(
+    source: Path, rig: Rig, out: Path, options: RefineOptions
+) -> tuple[ModelStart, ImageDatabase | None, KnownLengths]:
+    """The model, its database and the known lengths, read and checked."""
+    known = options.constraints
+    distance_m = scene_distance(rig, known.scene_distance_m)
+    model = _found(source)
+    if out.exists() and _same_or_inside(model.folder, out / SPARSE):
+        raise InputError(
+            f"{out / SPARSE} holds the model that is to be refined, which the result "
+            "would replace: choose another folder"
+        )
+    start = start_from_model(model, rig, distance_m, options.database)
+    if options.images is not None:
+        _check_images(options.images, rig, start)
+    matches = None
+    if options.database is not None:
+        matches = read_image_database(options.database, start.model, rig)
+    lengths = KnownLengths.read(known.lengths, known.positions, known.lever_arm)
+    names = start.model.frame_names if matches is None else matches.frame_names
+    lengths.check_names(rig, names)
+    return start, matches, lengths
 
 
 def _found(source: Path) -> FoundModel:
@@ -280,7 +284,7 @@ class _Job:
             self.progress,
             known=known,
             lengths=lengths,
-            **self.options.adjustment.fields(),
+            **self.options.adjustment.as_fields(),
         )
 
     def _require_raw(self, refined: Refined) -> None:
@@ -362,8 +366,8 @@ class _Job:
             own = theirs["median_error_px"] = None
             notes.append(
                 f"{source} is a result of uwsfm, refractive already: its lenses lack "
-                f"the refraction that its {HOUSING} holds, and its own error as a "
-                "COLMAP model is not told, for it means nothing"
+                f"the refraction that its {HOUSING} holds, and its error as a COLMAP "
+                "model has no meaning"
             )
         error = model.errors_px()[both]
         return {
