@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from sfm_scenes import model_of
+from summary_schema import schema_faults
 
 import uwsfm
 from uwsfm.demo import sample_dir
@@ -73,6 +74,7 @@ def test_a_colmap_model_gives_the_housing(dive, tmp_path, strategy, start):
     assert uwsfm.load_rig(tmp_path / "housing.yaml").cameras[0].port.distance > 0.015
     found = json.loads((tmp_path / HOUSING_SUMMARY).read_text())
     assert (found["strategy"], found["start"]) == (strategy, start)
+    assert schema_faults(found) == []
     # 3800 observations tell their noise to 1.5 %; pruning at 3.5 takes 0.7 %.
     assert found["sigma_px"] == pytest.approx(NOISE_PX, rel=0.05)
     # The rig of a simulation is exact: nothing that was given can be wrong.
