@@ -9,6 +9,7 @@ import yaml
 from bounds import LEAST, MOST
 from command_line import one_sentence, run
 from sfm_scenes import model_of
+from summary_schema import schema_faults
 from test_outside import (
     ARM,
     NAV_STDDEV,
@@ -110,6 +111,7 @@ def test_scale_arbitrary_is_said_wherever_a_length_is(mono, tmp_path):
     assert "scale arbitrary: nothing determines it" in text
     assert " mm" not in text and "(mm)" not in text
     summary = json.loads((out / "summary.json").read_text())
+    assert schema_faults(summary) == []
     assert summary["scale"]["verdict"] == "arbitrary"
     assert summary["scale"]["relative_stddev"] is None
     assert summary["scale"]["unit"] == "scale arbitrary"
@@ -183,6 +185,7 @@ def test_positions_make_one_camera_metric_and_place_it(mono, tmp_path, rng):
     text = " ".join(done.stdout.split())
     assert f"{len(wrong)} of 12 positions contradict the images" in text
     summary = json.loads((out / "summary.json").read_text())
+    assert schema_faults(summary) == []
     assert summary["positions"]["outliers"] == [f"{f:04}.jpg" for f in wrong]
     assert summary["scale"]["verdict"] == "determined"
     model = uwsfm.read_model(out)
