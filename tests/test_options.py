@@ -180,6 +180,7 @@ def refused(tmp_path, text: str) -> str:
         ("prior: {focal: 1}", "--prior focal=1: the key is one of distance_stddev_m,"),
         ("scene_distance_m: -1", "--scene-distance (scene_distance_m) must be positiv"),
         ("a: [", "line 2: not valid YAML"),
+        ("", "is empty instead of keys such as 'seed: 1'"),
     ],
 )
 def test_a_file_of_options_is_refused_in_one_sentence(tmp_path, text, words):

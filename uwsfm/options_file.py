@@ -55,7 +55,7 @@ def read_typed(
     known: dict[str, Option | None] = dict.fromkeys(extra)
     known |= {item.name: item for item in options}
     try:
-        data = read_yaml(path)
+        data = read_yaml(path, "seed: 1")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     found: dict[str, str | list[str]] = {}

@@ -11,4 +11,5 @@ SCHEMA_VERSION = 1
 def summary_schema() -> dict[str, Any]:
     """The schema of summary.json and calibration.json, each key with its unit."""
     text = (files("uwsfm.export") / "summary.schema.json").read_text(encoding="utf-8")
-    return json.loads(text)
+    schema: dict[str, Any] = json.loads(text)
+    return schema
