@@ -13,6 +13,7 @@ from uwsfm.batch import run_batch
 from uwsfm.dives_file import load_dives
 from uwsfm.errors import InputError
 from uwsfm.job_log import LOG
+from uwsfm.job_options import ReconstructOptions
 from uwsfm.rig_file import dump_rig
 from uwsfm.tasks import Workers
 
@@ -42,14 +43,14 @@ def test_dives_inherit_options_and_find_their_files(tmp_path):
     bow, other = load_dives(written(tmp_path, content))
     assert (bow.rig, bow.images) == (tmp_path / "rig.yaml", tmp_path / "wreck/bow")
     assert (bow.out, other.out) == (tmp_path / "bow", tmp_path / "results/stern")
-    assert bow.options == {"clahe": True}
-    assert other.options == {
-        "clahe": False,
-        "lengths": tmp_path / "wreck/lengths.yaml",
-        "lever_arm": (0.2, -0.1, 1.0),
-        "refine_water_index": True,
-        "water_index_stddev": 0.002,
-    }
+    assert bow.options == ReconstructOptions.of(clahe=True)
+    assert other.options == ReconstructOptions.of(
+        clahe=False,
+        lengths=tmp_path / "wreck/lengths.yaml",
+        lever_arm=(0.2, -0.1, 1.0),
+        refine_water_index=True,
+        water_index_stddev=0.002,
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,6 +69,10 @@ def test_dives_inherit_options_and_find_their_files(tmp_path):
             r"dives\[0\].options.prior.focal: unknown key; .* focal_stddev, ",
         ),
         ([{**DIVE, "options": {"seed": -1}}], r"options.seed: must be at least 0"),
+        (
+            [{**DIVE, "options": {"fundamental_max_error_px": 3.0}}],
+            r"dives\[0\].options: fundamental_max_error_px has no effect",
+        ),
         ([DIVE, DIVE], r"dives\[1\].name: is that of dives\[0\]"),
         (
             [DIVE, {**DIVE, "name": "stern", "out": "./bow"}],

@@ -6,8 +6,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from uwsfm._options import options_of
 from uwsfm.cli import app
+from uwsfm.job_options import (
+    CalibrateHousingOptions,
+    ReconstructOptions,
+    RefineOptions,
+)
 from uwsfm.measuring.picks import PointPick
+from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
 KNOWN = "--positions nav.csv --lever-arm 1,-2,3 --lengths bars.yaml"
 KNOWN_AS = {
@@ -24,8 +31,9 @@ CALIBRATION_AS = {
 
 PICKS = [PointPick(3), PointPick(4)]
 
-# Command line; the job's module and name; its positional and its other arguments. No
-# value is a default, and no two numbers are the same.
+# Command line; the job's module and name; its positional arguments; its options, by
+# name: of the class that is the last positional argument, or else its other arguments.
+# No value is a default, and no two numbers are the same.
 COMMANDS = {
     "reconstruct": (
         "rig.yaml photos -o out --clahe --max-features 777 --masks masks --matching "
@@ -34,6 +42,7 @@ COMMANDS = {
         f"{CALIBRATION}",
         "uwsfm.pipeline reconstruct",
         (Path("rig.yaml"), Path("photos"), Path("out")),
+        ReconstructOptions,
         {
             "clahe": True,
             "max_features": 777,
@@ -55,6 +64,7 @@ COMMANDS = {
         f"{KNOWN} {CALIBRATION}",
         "uwsfm.refine_pipeline refine_model",
         (Path("sparse"), Path("rig.yaml"), Path("out")),
+        RefineOptions,
         {
             "images": Path("photos"),
             "database": Path("db.db"),
@@ -65,13 +75,21 @@ COMMANDS = {
     ),
     "calibrate": (
         "rig.yaml photos -o out --strategy nested --error point_3d --start paper "
-        f"{KNOWN} {CALIBRATION}",
+        "--matcher paper --fundamental-max-error 9 --mapper refractive --max-features "
+        f"777 --seed 5 --threads 3 {KNOWN} {CALIBRATION}",
         "uwsfm.housing_pipeline calibrate_housing",
         (Path("rig.yaml"), Path("photos"), Path("out")),
+        CalibrateHousingOptions,
         {
             "strategy": "nested",
             "error": "point_3d",
             "start": "paper",
+            "front_end": StartOptions(
+                features=FeatureOptions(max_num_features=777),
+                matching=MatchOptions(matcher="paper", fundamental_max_error_px=9.0),
+                seed=5,
+                num_threads=3,
+            ),
             **KNOWN_AS,
             **CALIBRATION_AS,
         },
@@ -81,6 +99,7 @@ COMMANDS = {
         "--max-memory 5GB --threads 4 --quality low",
         "uwsfm.dense.run dense_cloud",
         (Path("out"), Path("photos")),
+        None,
         {
             "voxel": 0.002,
             "min_views": 3,
@@ -103,6 +122,7 @@ COMMANDS = {
             },
             Path("m.json"),
         ),
+        None,
         {},
     ),
 }
@@ -130,26 +150,14 @@ def call(monkeypatch, command, line, job):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_options_reach_the_job(command, monkeypatch):
-    line, job, expected_args, expected = COMMANDS[command]
+    line, job, expected_args, kind, expected = COMMANDS[command]
     args, options = call(monkeypatch, command, line, job)
     options.pop("progress", None)
-    front_end = options.pop("front_end", None)
-    assert args == expected_args
-    assert options == expected
-    assert (front_end is not None) == (command == "calibrate")
-
-
-def test_the_front_end_of_a_calibration_is_as_asked(monkeypatch):
-    line = (
-        "rig.yaml photos -o out --matcher paper --fundamental-max-error 9 --mapper "
-        "refractive --max-features 777 --seed 5 --threads 3"
-    )
-    _, options = call(
-        monkeypatch, "calibrate", line, "uwsfm.housing_pipeline calibrate_housing"
-    )
-    front_end = options["front_end"]
-    assert front_end.matching.matcher == "paper"
-    assert front_end.matching.fundamental_max_error_px == 9.0
-    assert front_end.mapper == "refractive"
-    assert front_end.features.max_num_features == 777
-    assert (front_end.seed, front_end.num_threads) == (5, 3)
+    if kind is not None:
+        *args, found = args
+        assert found == kind.of(**expected) and options == {}
+        by_name = {option.name for option in options_of(kind)}
+        assert len(by_name & set(expected)) > 5
+    else:
+        assert options == expected
+    assert tuple(args) == expected_args

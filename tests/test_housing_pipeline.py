@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 from sfm_scenes import model_of
+from summary_schema import schema_faults
 
 import uwsfm
 from uwsfm.demo import sample_dir
@@ -16,6 +17,7 @@ from uwsfm.export.files import export_colmap
 from uwsfm.geometry import unit_vector
 from uwsfm.housing_pipeline import calibrate_housing
 from uwsfm.job_log import LOG
+from uwsfm.options_file import OPTIONS
 from uwsfm.output_folder import HOUSING_SUMMARY
 from uwsfm.rig_file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
@@ -72,12 +74,13 @@ def test_a_colmap_model_gives_the_housing(dive, tmp_path, strategy, start):
     assert uwsfm.load_rig(tmp_path / "housing.yaml").cameras[0].port.distance > 0.015
     found = json.loads((tmp_path / HOUSING_SUMMARY).read_text())
     assert (found["strategy"], found["start"]) == (strategy, start)
+    assert schema_faults(found) == []
     # 3800 observations tell their noise to 1.5 %; pruning at 3.5 takes 0.7 %.
     assert found["sigma_px"] == pytest.approx(NOISE_PX, rel=0.05)
     # The rig of a simulation is exact: nothing that was given can be wrong.
     assert [row["if"] for row in found["error_budget"]] == ["all of these together"]
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"housing.yaml", HOUSING_SUMMARY, LOG, "uwsfm-work"}
+    assert names == {"housing.yaml", HOUSING_SUMMARY, OPTIONS, LOG, "uwsfm-work"}
 
 
 def test_refined_water_and_lenses_arrive_in_the_housing(dive, tmp_path):
@@ -256,5 +259,9 @@ def test_the_front_end_of_a_model_is_refused(dive, tmp_path):
     front_end = uwsfm.StartOptions(mapper="refractive")
     with pytest.raises(uwsfm.InputError, match="mapper has no effect: a COLMAP model"):
         calibrate_housing(folder / "rig.yaml", folder, tmp_path, front_end=front_end)
+    for name, value in (("clahe", True), ("max_features", 500), ("masks", "masks")):
+        with pytest.raises(uwsfm.InputError, match=f"{name} has no effect"):
+            how = {name: value}
+            calibrate_housing(folder / "rig.yaml", folder, tmp_path, **how)
     with pytest.raises(uwsfm.InputError, match="give matcher 'paper'"):
         uwsfm.MatchOptions(fundamental_max_error_px=3.0)

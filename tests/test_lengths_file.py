@@ -9,6 +9,7 @@ import yaml
 from bounds import LEAST, MOST
 from command_line import one_sentence, run
 from sfm_scenes import model_of
+from summary_schema import schema_faults
 from test_outside import (
     ARM,
     NAV_STDDEV,
@@ -22,8 +23,9 @@ from test_outside import (
 
 import uwsfm
 from uwsfm import InputError
+from uwsfm._options import option_named
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.cli_options import lever_arm_of
+from uwsfm.cli_options import vector_of
 from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
@@ -109,6 +111,7 @@ def test_scale_arbitrary_is_said_wherever_a_length_is(mono, tmp_path):
     assert "scale arbitrary: nothing determines it" in text
     assert " mm" not in text and "(mm)" not in text
     summary = json.loads((out / "summary.json").read_text())
+    assert schema_faults(summary) == []
     assert summary["scale"]["verdict"] == "arbitrary"
     assert summary["scale"]["relative_stddev"] is None
     assert summary["scale"]["unit"] == "scale arbitrary"
@@ -182,6 +185,7 @@ def test_positions_make_one_camera_metric_and_place_it(mono, tmp_path, rng):
     text = " ".join(done.stdout.split())
     assert f"{len(wrong)} of 12 positions contradict the images" in text
     summary = json.loads((out / "summary.json").read_text())
+    assert schema_faults(summary) == []
     assert summary["positions"]["outliers"] == [f"{f:04}.jpg" for f in wrong]
     assert summary["scale"]["verdict"] == "determined"
     model = uwsfm.read_model(out)
@@ -276,7 +280,7 @@ def test_unknown_names_are_refused_before_anything_is_written(mono, tmp_path, rn
     one_sentence(done, "'0000.png' is not among the images", "'0000.jpg'")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="--lever-arm 1,2: write three numbers"):
-        lever_arm_of("1,2")
+        vector_of(option_named(uwsfm.ReconstructOptions, "lever_arm"), "1,2")
     with pytest.raises(InputError, match=r"^--lever-arm .* no effect without"):
         KnownLengths.read(None, None, [1.0, 2.0, 3.0])
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from summary_schema import schema_faults
 from test_three_cameras import three_camera_rig
 
 from uwsfm import (
@@ -92,6 +93,7 @@ def test_what_is_said_of_a_dome(tmp_path):
     result = calibrate(dive(noise_px=0.4).scene, loss="l2")
     rig = mixed_rig().with_geometry(result.scene.cam_from_rig, result.scene.ports)
     flat, dome, bare = housing_summary(rig, result)
+    assert [schema_faults(c, "camera") for c in (flat, dome, bare)] == 3 * [[]]
     assert flat["port"] == "flat" and flat["distance_verdict"] == "determined"
     assert dome["port"] == "dome" and dome["center_verdict"] == "determined"
     assert min(dome["center_stddev_m"]) > 0.0

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from summary_schema import schema_faults
 
 import uwsfm
 from uwsfm.calibration.uncertainty import predict_covariance
@@ -124,6 +125,7 @@ def test_summary_says_everything(demo):
     out, result = demo.out, demo.result
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(result.summary))
+    assert schema_faults(summary) == []
     for camera in summary["cameras"]:
         assert math.isclose(np.linalg.norm(camera["normal"]), 1.0)
         for key in ("distance_m", "normal_stddev_deg", "distance_stddev_m"):

@@ -16,7 +16,7 @@ import uwsfm
 from uwsfm import InputError
 from uwsfm.cli import app
 from uwsfm.geometry import rigid3
-from uwsfm.pipeline import reconstruct
+from uwsfm.job_options import ReconstructOptions
 from uwsfm.report.command import command_line
 from uwsfm.report.files import FOLDER, NUMBERS, PAGE, write_with_report
 from uwsfm.report.gather import gather
@@ -151,42 +151,34 @@ def test_report_of_what_is_no_result_is_refused(tmp_path):
 
 
 def test_the_command_is_one_that_the_program_takes(tmp_path):
-    asked = {
-        "rig": tmp_path / "my rig.yaml",
-        "images": "images",
-        "out": "out",
-        "clahe": True,
-        "max_features": 3000,
-        "masks": None,
-        "matching": "sequential",
-        "matcher": "colmap",
-        "mapper": "refractive",
-        "positions": "nav.csv",
-        "lever_arm": (-0.2, 0.0, 1.5),
-        "lengths": None,
-        "scene_distance_m": 2.5,
-        "seed": 3,
-        "num_threads": -1,
-        "submap_frames": None,
-        "scheduler": "local",
-        "report": False,
-        "progress": print,
-        "calibration": {"refine_water_index": True, "water_index_stddev": 0.002},
-    }
-    text = command_line("reconstruct", reconstruct, asked)
+    options = ReconstructOptions.of(
+        clahe=True,
+        max_features=3000,
+        matching="sequential",
+        positions="nav.csv",
+        lever_arm=(-0.2, 0.0, 1.5),
+        scene_distance_m=2.5,
+        seed=3,
+        report=False,
+        refine_water_index=True,
+        water_index_stddev=0.002,
+    )
+    inputs = (tmp_path / "my rig.yaml", "images")
+    text = command_line("reconstruct", inputs, "out", options)
     program, command, *words = shlex.split(text)
     assert program == "uwsfm"
     parsed = typer.main.get_command(app).commands[command].make_context(command, words)
     found = parsed.params
-    assert found["rig"] == asked["rig"] and found["clahe"] is True
+    assert found["rig"] == inputs[0] and found["clahe"] is True
     assert found["max_features"] == 3000
     assert found["matching"] == "sequential" and found["seed"] == 3
-    assert found["report"] is False and found["threads"] == -1
-    assert found["lever_arm"] == "-0.2,0,1.5" and found["scene_distance"] == 2.5
-    assert [item.value for item in found["also"]] == ["water-index"]
+    assert found["report"] is False and found["num_threads"] == -1
+    assert found["lever_arm"] == "-0.2,0,1.5" and found["scene_distance_m"] == 2.5
+    assert [item.value for item in found["refine"]] == ["water-index"]
     assert found["prior"] == ["water_index_stddev=0.002"]
-    in_python = {**asked, "calibration": {"max_iterations": 3}}
-    assert command_line("reconstruct", reconstruct, in_python) is None
+    in_python = options.with_settings({"max_iterations": 3})
+    assert command_line("reconstruct", inputs, "out", in_python) is None
+    assert command_line("reconstruct", (object(), "images"), "out", options) is None
 
 
 def test_digits_follow_the_standard_deviation():

@@ -9,6 +9,7 @@ import yaml
 from given_changes import scaled_accuracy
 
 from uwsfm import calibrate
+from uwsfm._options import option_named
 from uwsfm.calibration import given_accuracy as defaults
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.given_accuracy import (
@@ -18,9 +19,10 @@ from uwsfm.calibration.given_accuracy import (
 )
 from uwsfm.calibration.problem import PRIORS
 from uwsfm.calibration.tilt import paper_tilt
-from uwsfm.cli_options import priors_of
+from uwsfm.cli_options import numbers_of
 from uwsfm.errors import InputError
 from uwsfm.export.housing import export_housing
+from uwsfm.job_options import ReconstructOptions
 from uwsfm.models.port import FlatPort
 from uwsfm.residuals import border
 from uwsfm.rig_file import dump_rig, load_rig, template
@@ -29,6 +31,7 @@ from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
 
+PRIOR = option_named(ReconstructOptions, "prior")
 NAMES = ["left.fx", "left.k1", "right.fx", "right.rotation_z"]
 ROOT = np.diag([1.0, 0.01, 2.0, 1e-3]) @ np.linalg.cholesky(
     0.5 * np.eye(4) + 0.5 * np.ones((4, 4))
@@ -323,9 +326,10 @@ def test_every_stated_accuracy_has_a_range_and_every_prior(tmp_path):
         if key == "distortion":
             continue
         most, _ = ACCURACIES[key]
-        assert priors_of([f"{prior}={0.5 * most}"]) == {prior: 0.5 * most}
+        typed = f"{prior}={0.5 * most}"
+        assert numbers_of(PRIOR, [typed]) == {prior: 0.5 * most}
         with pytest.raises(InputError, match=f"--prior {prior}=.*no plausible"):
-            priors_of([f"{prior}={2.0 * most}"])
+            numbers_of(PRIOR, [f"{prior}={2.0 * most}"])
 
 
 def test_a_housing_states_the_rotation_that_was_estimated_and_loads_again(tmp_path):

@@ -174,7 +174,7 @@ def test_image_of_another_size_is_named_with_both_sizes(image_dir, rig):
 
 def test_options_refuse_what_they_cannot_do(tmp_path):
     with pytest.raises(InputError, match="mask directory"):
-        FeatureOptions(mask_dir=tmp_path / "nowhere")
+        FeatureOptions(mask_dir=tmp_path / "nowhere").require_masks()
     with pytest.raises(InputError, match="'random'"):
         MatchOptions(strategy="random")  # type: ignore[arg-type]
 

@@ -24,7 +24,7 @@ from uwsfm.simulate import SimulatedScene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 
 NUM_FRAMES = 6
-OPTIONS = StartOptions(num_threads=2)
+OPTIONS = StartOptions(num_threads=2, mapper="pinhole")
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def shape_error(arrays: StartArrays, truth_rig: Rig) -> float:
 @pytest.mark.parametrize("kind", ["flat", "dome"])
 def test_one_camera_at_a_given_distance(tmp_path, kind):
     rig = single() if kind == "flat" else single(1, mixed_rig())
-    options = StartOptions(num_threads=2, scene_distance_m=2.0)
+    options = StartOptions(num_threads=2, scene_distance_m=2.0, mapper="pinhole")
     arrays = arrays_of(nominal_rig(rig), rig, tmp_path, options)
     # Refraction at tilted ports bends the shape by a few per cent, no more.
     assert shape_error(arrays, rig) < 0.06
@@ -72,7 +72,9 @@ def test_domes_make_a_metric_start(tmp_path):
         replace(camera, port=dome, refine_center=True) for camera in rig.cameras
     )
     rig = replace(rig, cameras=cameras)
-    arrays = arrays_of(nominal_rig(rig), rig, tmp_path, StartOptions(num_threads=2))
+    arrays = arrays_of(
+        nominal_rig(rig), rig, tmp_path, StartOptions(num_threads=2, mapper="pinhole")
+    )
     truth = simulated_dive(rig, num_frames=NUM_FRAMES).truth.rig_from_world
     moved = rigid3.compose(rigid3.inverse(truth[0]), arrays.rig_from_world[0])
     centers = rigid3.transform(moved, rigid3.inverse(arrays.rig_from_world)[:, 4:])

@@ -25,7 +25,7 @@ from uwsfm.sfm.start import perspective_start
 
 NUM_FRAMES = 3
 SCALE = 0.4
-OPTIONS = StartOptions(num_threads=2)
+OPTIONS = StartOptions(num_threads=2, mapper="pinhole")
 
 # Runs a start, and kills itself when a step has come far enough.
 CHILD = """
@@ -43,7 +43,7 @@ def progress(step, done, total):
     if step == fatal_step and done >= int(fatal_count):
         os.kill(os.getpid(), signal.SIGKILL)
 
-options = StartOptions(num_threads=2)
+options = StartOptions(num_threads=2, mapper="pinhole")
 perspective_start(
     load_rig(rig_path), Path(image_dir), Path(work_dir), options, progress
 )
@@ -204,7 +204,7 @@ def test_clahe_and_masks_reach_the_features(rig, image_dir, tmp_path):
         target.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(target), mask)
     features = FeatureOptions(clahe=True, mask_dir=masks)
-    options = StartOptions(features=features, num_threads=2)
+    options = StartOptions(features=features, num_threads=2, mapper="pinhole")
     work_dir = tmp_path / "work"
     perspective_start(rig, image_dir, work_dir, options)
     with opened(work_dir / "database.db") as database:

@@ -18,7 +18,7 @@ from uwsfm.sfm.start import perspective_start
 
 DATA = Path(os.environ.get("UWSFM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TANK = DATA / "uril_tank"
-OPTIONS = StartOptions(num_threads=2)
+OPTIONS = StartOptions(num_threads=2, mapper="pinhole")
 
 pytestmark = [
     pytest.mark.slow,

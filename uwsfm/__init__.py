@@ -30,6 +30,11 @@ if TYPE_CHECKING:
     from uwsfm.export.refractive_colmap import export_refractive_colmap
     from uwsfm.export.scene_ply import export_scene_ply
     from uwsfm.housing_pipeline import calibrate_housing
+    from uwsfm.job_options import (
+        CalibrateHousingOptions,
+        ReconstructOptions,
+        RefineOptions,
+    )
     from uwsfm.measuring.measure import measure
     from uwsfm.models.port import DomePort, FlatPort, NoPort
     from uwsfm.models.refractive import RefractiveCamera
@@ -61,6 +66,7 @@ logger = logging.getLogger("uwsfm")
 logger.addHandler(logging.NullHandler())
 
 _HOMES = {
+    "CalibrateHousingOptions": "uwsfm.job_options",
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
     "Cloud": "uwsfm.cloud",
@@ -107,6 +113,8 @@ _HOMES = {
     "open_result": "uwsfm.result_folder",
     "MatchOptions": "uwsfm.sfm.options",
     "StartOptions": "uwsfm.sfm.options",
+    "ReconstructOptions": "uwsfm.job_options",
+    "RefineOptions": "uwsfm.job_options",
     "reconstruct": "uwsfm.pipeline",
     "refine_model": "uwsfm.refine_pipeline",
     "run_batch": "uwsfm.batch",
@@ -117,6 +125,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "CalibrateHousingOptions",
     "CalibrateOptions",
     "CalibrationResult",
     "Cloud",
@@ -129,6 +138,8 @@ __all__ = [
     "Model",
     "NoPort",
     "Positions",
+    "ReconstructOptions",
+    "RefineOptions",
     "RefractiveCamera",
     "Result",
     "Rig",

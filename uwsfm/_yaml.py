@@ -46,8 +46,12 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_yaml(path: Path) -> dict:
+def read_yaml(path: Path, example: str = "version: 1") -> dict:
     """The keys and values of a YAML file.
+
+    Args:
+        path: Of the file.
+        example: A line that the file may have, for the error.
 
     Raises:
         InputError: one sentence with the line, without the path: no such file, not
@@ -70,7 +74,7 @@ def read_yaml(path: Path) -> dict:
             loader.dispose()
     if not isinstance(data, dict):
         what = "is empty" if data is None else f"holds {reprlib.repr(data)}"
-        raise InputError(f"{what} instead of keys such as 'version: 1'")
+        raise InputError(f"{what} instead of keys such as {example!r}")
     return data
 
 

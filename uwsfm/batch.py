@@ -117,9 +117,8 @@ def run_dive(dive: Dive, num_threads: int) -> Outcome:
         out.mkdir(parents=True, exist_ok=True)
         with log_file(out / LOG):
             logger.info("dive %s, images %s", dive.name, dive.images)
-            result = reconstruct(
-                dive.rig, dive.images, out, num_threads=num_threads, **dive.options
-            )
+            options = dive.options.with_settings({"num_threads": num_threads})
+            result = reconstruct(dive.rig, dive.images, out, options)
     except UwsfmError as error:
         reason = str(error)
     except MemoryError:

@@ -10,13 +10,14 @@ from uwsfm.cli_options import SchedulerOption
 
 def batch(
     dives: Annotated[
-        Path, typer.Argument(help="A YAML file of dives, see the README.")
+        Path, typer.Argument(help="The YAML file of the dives, see the README.")
     ],
     scheduler: SchedulerOption = "local",
     threads: Annotated[
         int,
         typer.Option(
-            min=-1, help="Number of threads of all dives together. -1: all cores."
+            min=-1,
+            help="Number of threads of all dives together. -1: one for each core.",
         ),
     ] = -1,
 ) -> None:

@@ -27,9 +27,10 @@ def check(
         bool,
         typer.Option(
             "--halves",
-            help="Cross-validate instead: adjust disjoint halves of the frames, each "
-            "alone, and compare them. Where they differ by significantly more than "
-            "predicted, the result's standard deviations are enlarged.",
+            help="Cross-validate instead of looking for a mistake: adjust disjoint "
+            "halves of the frames, each alone, and compare them. Where they differ by "
+            "significantly more than predicted, the result's standard deviations are "
+            "enlarged.",
         ),
     ] = False,
 ) -> None:

@@ -1,7 +1,7 @@
 """`uwsfm dense`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -21,48 +21,51 @@ def dense(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The images' folder, if they were moved.", show_default=False
+            help="Folder where the images are now. Default: where they were.",
+            show_default=False,
         ),
     ] = None,
     voxel: Annotated[
         float | None,
         typer.Option(
             help="Side of the voxels that points are merged in, in the unit of the "
-            "model; by default the footprint of a pixel.",
+            "model. Default: the footprint of a pixel.",
             show_default=False,
         ),
     ] = None,
     min_views: Annotated[
-        int, typer.Option(min=1, help="Depth maps that have to agree on a point.")
+        int,
+        typer.Option(min=1, help="Number of depth maps that have to agree on a point."),
     ] = 2,
     keep_single: Annotated[
-        bool, typer.Option(help="Keep also what one depth map alone sees.")
+        bool, typer.Option(help="Keep the points that only one depth map sees, too.")
     ] = False,
     noise_px: Annotated[
         float | None,
         typer.Option(
-            help="Standard deviation of a disparity; by default from the differences "
-            "between depth maps.",
+            help="Standard deviation of a disparity, in pixels. Default: estimated "
+            "from the differences between depth maps.",
             show_default=False,
         ),
     ] = None,
     quality: Annotated[
-        str,
+        Literal["high", "medium", "low"],
         typer.Option(
-            help="high, medium or low: how far large images are reduced. medium: to "
-            "0.6 megapixels for patchmatch, to 2.4 for stereo."
+            help="Size to which large images are reduced: high, medium or low. medium "
+            "is 0.6 megapixels with patchmatch, 2.4 with stereo."
         ),
     ] = "medium",
     matcher: Annotated[
-        str,
+        Literal["auto", "stereo", "patchmatch"],
         typer.Option(
-            help="stereo: pairs of cameras, rectified (fast). patchmatch: each image "
-            "with six others of any camera. auto: stereo where cameras can be "
-            "rectified."
+            help="Way to find depths. stereo: rectified pairs of cameras, which is "
+            "fast. patchmatch: each image with six others of any camera. auto: stereo "
+            "where cameras can be rectified."
         ),
     ] = "auto",
     max_memory: Annotated[
-        str, typer.Option(help="Of the whole process, as 2GB or 800MB.")
+        str,
+        typer.Option(help="Most memory of the whole process, as 2GB or 800MB."),
     ] = "2GB",
     threads: ThreadsOption = -1,
 ) -> None:

@@ -14,26 +14,28 @@ def export(
     model: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="The output of uwsfm reconstruct; las, laz: or a PLY."
+            metavar="OUT",
+            help="The output of uwsfm reconstruct; for las and laz also a PLY file.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder or file to write.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The folder or file to write.")
+    ],
     to: Annotated[
         Literal["pinhole", "splatting", "refractive-colmap", "ply", "las", "laz"],
         typer.Option(
-            help="pinhole: a central COLMAP model for stock tools, without refraction; "
-            "splatting: the same with the names that trainers of Gaussian splatting "
-            "want, --images needed; "
-            "refractive-colmap: the text format of Refractive COLMAP; "
-            "ply: points, cameras and ports in one file; las, laz: the dense cloud, or "
-            "the points if there is none."
+            help="The format to write. pinhole: a central COLMAP model for stock "
+            "tools, without refraction. splatting: the same with the names that "
+            "trainers of Gaussian splatting want, --images needed. refractive-colmap: "
+            "the text format of Refractive COLMAP. ply: points, cameras and ports in "
+            "one file. las, laz: the dense cloud, or the points if there is none."
         ),
     ],
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The images that were reconstructed: pinhole and splatting warp them "
-            "by the depth.",
+            help="Folder of the images that were reconstructed, which pinhole and "
+            "splatting warp by the depth. Default: no images are written.",
             show_default=False,
         ),
     ] = None,
@@ -41,8 +43,8 @@ def export(
         bool | None,
         typer.Option(
             "--flat-names/--folder-names",
-            help="Images as left_0001.jpg or as left/0001.jpg. Default: flat for "
-            "splatting, with folders for pinhole.",
+            help="How images are named: left_0001.jpg or left/0001.jpg. Default: flat "
+            "for splatting, with folders for pinhole.",
             show_default=False,
         ),
     ] = None,
@@ -87,7 +89,7 @@ def export(
 
 
 def _note_verdict(folder: Path) -> None:
-    """Files for other programs do not carry the verdict: it is told once more."""
+    """Files for other programs do not carry the verdict: print it once more."""
     from rich.markup import escape
 
     from uwsfm.console import console

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from uwsfm.measuring.picks import Pick
 
 _PICK = (
-    "a point id (1234), a place of a cloud (0.1,-0.4,1.9), or pixels "
+    "a point id (1234), a place in the cloud (0.1,-0.4,1.9), or pixels "
     "(left/01.png:412.5,300+right/01.png:380,311)"
 )
 
@@ -27,36 +27,56 @@ def measure(
     measurements: Annotated[
         Path | None,
         typer.Argument(
-            help="measurements.yaml: distances, polylines, areas, heights, angles and "
-            "scale bars, see the README.",
+            help="A YAML file of what to measure: distances, polylines, areas, "
+            "heights, angles and scale bars, see the README. Default: one distance, "
+            "--from and --to.",
             show_default=False,
         ),
     ] = None,
     start: Annotated[
         str | None,
         typer.Option(
-            "--from", metavar="PICK", help=f"One end: {_PICK}.", show_default=False
+            "--from",
+            metavar="PICK",
+            help=f"One end of a distance: {_PICK}. Default: what the file names.",
+            show_default=False,
         ),
     ] = None,
     end: Annotated[
         str | None,
-        typer.Option("--to", metavar="PICK", help="The other.", show_default=False),
+        typer.Option(
+            "--to",
+            metavar="PICK",
+            help="The other end of the distance, written as the first. Default: what "
+            "the file names.",
+            show_default=False,
+        ),
     ] = None,
     known: Annotated[
         float | None,
         typer.Option(
             metavar="METRES",
-            help="How long it is known to be: a scale bar, to check.",
+            help="Known length of the distance, if it is a scale bar that is to be "
+            "checked. Default: it is not known.",
             show_default=False,
         ),
     ] = None,
     click_stddev: Annotated[
         float | None,
-        typer.Option(metavar="PX", help="Noise of clicked pixels.", show_default=False),
+        typer.Option(
+            metavar="PX",
+            help="Standard deviation of clicked pixels, per coordinate. Default: 1.",
+            show_default=False,
+        ),
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="JSON file to write.", show_default=False),
+        typer.Option(
+            "--out",
+            "-o",
+            help="The JSON file to write. Default: no file, only the table.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Measure in a result: lengths, areas, angles, with their standard deviations."""

@@ -1,155 +1,208 @@
-"""Options that several commands share, and how their texts are read."""
+"""The options of commands: those of the jobs, as they are declared, and shared ones."""
 
-from collections.abc import Iterable
-from enum import Enum
+import enum
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import typer
 
+from uwsfm._options import Option, option_named, options_of
 from uwsfm.errors import InputError
+from uwsfm.job_options import JobOptions, ReconstructOptions
+from uwsfm.sfm.options import Mapper
+
+OUT = "out"
+"""The parameter of `ResultsOption`, which a file of options may hold, too."""
+NOT_GIVEN: tuple[Any, ...] = (None, (), {})
+"""Defaults that say nothing: the help of the option does."""
 
 
-class Refinable(str, Enum):
-    """What --refine takes: the fields refine_... of `CalibrateOptions`."""
+def takes(
+    kind: type[JobOptions],
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a command take all options of a job, and --config.
 
-    WATER_INDEX = "water-index"
-    FOCAL = "focal"
-    PRINCIPAL_POINT = "principal-point"
-    DISTORTION = "distortion"
+    Args:
+        kind: Options of the job. The decorated function gets them as ``options``.
+    """
 
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        declared = options_of(kind)
+        own = inspect.signature(command, eval_str=True).parameters.values()
+        parameters = [p for p in own if p.name != "options"]
+        parameters += [_parameter(item) for item in declared]
+        parameters.append(_config(declared))
 
-RefineOption = Annotated[
-    list[Refinable] | None,
-    typer.Option(
-        "--refine", help="Refine this too; may be repeated.", show_default=False
-    ),
-]
-PriorOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="KEY=VALUE",
-        help="What is known: distance_stddev_m, normal_stddev_deg, center_stddev_m, "
-        "water_index_stddev, focal_stddev (relative), principal_point_stddev_px, "
-        "distortion_stddev; may be repeated.",
-        show_default=False,
-    ),
-]
-RigArgument = Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")]
-ResultsOption = Annotated[
-    Path, typer.Option("--out", "-o", help="Folder for the results.")
-]
-MatcherOption = Annotated[
-    Literal["colmap", "paper"],
-    typer.Option(help="paper: kd-trees and a tolerant fundamental matrix."),
-]
-MaxFeaturesOption = Annotated[
-    int | None,
-    typer.Option(
-        min=100,
-        help="Features per image, about. Default: by the size of the images, 8192 up "
-        "to 2 megapixels, 12288 from 4.5. More features take more time.",
-        show_default=False,
-    ),
-]
-SeedOption = Annotated[
-    int,
-    typer.Option(
-        min=0,
-        max=2**31 - 1,
-        help="Seed of the random number generator. The same seed gives the same "
-        "result.",
-    ),
-]
-ThreadsOption = Annotated[int, typer.Option(min=-1, help="-1: all cores.")]
-MapperOption = Annotated[
-    Literal["pinhole", "refractive"],
-    typer.Option(help="pinhole: COLMAP's, and water rays in the last step only."),
-]
-SceneDistanceOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="METRES",
-        help="Rough distance from a single camera to its scene. Default: 1. Not for "
-        "rigs of two or more cameras, which measure it.",
-        show_default=False,
-    ),
-]
-SchedulerOption = Annotated[
-    str,
-    typer.Option(
-        metavar="local|tcp://HOST:PORT",
-        help="Where parallel work is done. local: in processes of this machine. An "
-        "address: by the workers of the Dask scheduler there, on which all folders "
-        "have the same paths as here.",
-    ),
-]
-ReportOption = Annotated[
-    bool, typer.Option("--report/--no-report", help="Write report.html.")
-]
-PositionsOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Positions of the frames (navigation, GPS): CSV with the header "
-        "frame,x,y,z,sx,sy,sz in metres, in a local right-handed frame; or "
-        "frame,depth,sdepth where only depths are known.",
-        show_default=False,
-    ),
-]
-LeverArmOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z",
-        help="The antenna of the positions in the frame of the first camera, metres.",
-        show_default=False,
-    ),
-]
-LengthsOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Scale bars and distances between frames: a YAML file, see the README.",
-        show_default=False,
-    ),
-]
+        @functools.wraps(command)
+        def run(**given: Any) -> None:
+            del given["config"]  # its callback has read it
+            settings = {i.name: _read(i, given.pop(i.name)) for i in declared}
+            command(**given, options=kind.of(**settings))
+
+        by_name = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
+        run.__signature__ = inspect.Signature(by_name)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        return run
+
+    return decorated
 
 
-def lever_arm_of(text: str | None) -> tuple[float, ...] | None:
-    if text is None:
+def as_typed(item: Option) -> Any:
+    """A declared option as typer's; its type and its default are the caller's."""
+    flag = item.flag
+    return typer.Option(
+        f"{flag}/{item.negative_flag}" if item.type is bool else flag,
+        metavar=item.metavar,
+        min=item.declared.minimum,
+        max=item.declared.maximum,
+        help=item.declared.help,
+        show_default=item.default not in NOT_GIVEN,
+        rich_help_panel=item.panel,
+    )
+
+
+def _parameter(item: Option) -> inspect.Parameter:
+    """A parameter of a command's function, from which typer makes an option."""
+    kind: Any = item.type
+    if item.is_list:
+        words = {word: word for word in item.choices}
+        kind = list[enum.Enum(item.name, words, type=str)]  # type: ignore[misc]
+    elif item.is_mapping:
+        kind = list[str]
+    elif item.is_vector:
+        kind = str
+    default = item.default
+    if default in NOT_GIVEN:
+        kind, default = kind | None, None
+    return inspect.Parameter(
+        item.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[kind, as_typed(item)],
+    )
+
+
+def _read(item: Option, value: Any) -> Any:
+    """What typer took for an option, as its declared type."""
+    if value is None:
         return None
+    if item.is_list:
+        return tuple(word.value for word in value)
+    if item.is_mapping:
+        return numbers_of(item, value)
+    return vector_of(item, value) if item.is_vector else value
+
+
+def vector_of(item: Option, text: str) -> tuple[float, ...]:
+    """X,Y,Z as numbers.
+
+    Raises:
+        InputError: they are not three.
+    """
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 3:
-        raise InputError(f"--lever-arm {text}: write three numbers X,Y,Z in metres")
+        raise InputError(f"{item.flag} {text}: write three numbers X,Y,Z in metres")
     return values
 
 
-def wanted_of(what: Iterable[Refinable]) -> dict[str, bool]:
-    """--refine, as fields of `CalibrateOptions`."""
-    return {f"refine_{item.value.replace('-', '_')}": True for item in what}
+def numbers_of(item: Option, texts: Iterable[str]) -> dict[str, float]:
+    """KEY=VALUE, given some times, as numbers by key.
 
-
-def priors_of(texts: Iterable[str]) -> dict[str, float]:
-    """KEY=VALUE, as fields of `CalibrateOptions`."""
-    from uwsfm.calibration.problem import PRIORS
+    Raises:
+        InputError: a key is unknown or given twice, or a value is no number or no
+            plausible one.
+    """
     from uwsfm.rig_values import checked_accuracy
 
-    found = {}
+    numbers: dict[str, float] = {}
     for text in texts:
+        typed, known = f"{item.flag} {text}", item.declared.keys
         key, _, value = text.partition("=")
-        if key not in PRIORS:
-            raise InputError(f"--prior {text}: the key is one of {', '.join(PRIORS)}")
-        if key in found:
-            raise InputError(f"--prior {text}: {key} is given twice")
+        if key not in known:
+            raise InputError(f"{typed}: the key is one of {', '.join(known)}")
+        if key in numbers:
+            raise InputError(f"{typed}: {key} is given twice")
         try:
-            found[key] = float(value)
+            numbers[key] = float(value)
         except ValueError:
             raise InputError(
-                f"--prior {text}: {value!r} is not a number; write KEY=VALUE"
+                f"{typed}: {value!r} is not a number; write KEY=VALUE"
             ) from None
         try:
-            checked_accuracy(key, found[key])
+            checked_accuracy(key, numbers[key])
         except InputError as error:
-            raise InputError(f"--prior {text}: {error}") from None
+            raise InputError(f"{typed}: {error}") from None
+    return numbers
+
+
+def _config(declared: Sequence[Option]) -> inspect.Parameter:
+    """--config, whose callback puts the file's options in the place of the defaults."""
+
+    def read(context: typer.Context, path: Path | None) -> Path | None:
+        if path is not None and not context.resilient_parsing:
+            context.default_map = _from_file(context, path, declared)
+        return path
+
+    typed = typer.Option(
+        "--config",
+        metavar="FILE.yaml",
+        is_eager=True,
+        callback=read,
+        help="YAML file of options by name, as the options.yaml of a result. What is "
+        "typed besides wins. Paths are relative to the working folder. Default: no "
+        "file.",
+        show_default=False,
+    )
+    return inspect.Parameter(
+        "config",
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[Path | None, typed],
+    )
+
+
+def _from_file(
+    context: typer.Context, path: Path, declared: Sequence[Option]
+) -> dict[str, Any]:
+    """The options of a file as if they were typed, each checked as if it were.
+
+    Raises:
+        InputError: one sentence with the file, the key and what is wrong.
+    """
+    from uwsfm.options_file import read_typed
+
+    known = {item.name: item for item in declared}
+    found = read_typed(path, declared, extra=(OUT,))
+    for parameter in context.command.params:
+        if parameter.name not in found:
+            continue
+        item, text = known.get(parameter.name), found[parameter.name]
+        try:
+            value = parameter.process_value(context, text)
+            if item is not None:
+                item.check(_read(item, value))
+        except typer.BadParameter as error:
+            raise InputError(f"{path}: {parameter.name}: {error.message}") from None
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
     return found
+
+
+_SEED, _THREADS, _SCHEDULER, _MAPPER = (
+    as_typed(option_named(ReconstructOptions, name))
+    for name in ("seed", "num_threads", "scheduler", "mapper")
+)
+RigArgument = Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")]
+ResultsOption = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder that receives the results.")
+]
+SeedOption = Annotated[int, _SEED]
+ThreadsOption = Annotated[int, _THREADS]
+SchedulerOption = Annotated[str, _SCHEDULER]
+MapperOption = Annotated[Mapper, _MAPPER]

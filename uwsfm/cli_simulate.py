@@ -14,7 +14,7 @@ MAX_RANGE_M = 10
 
 
 def _number(low: float, high: float, what: str) -> Any:
-    """An option in a range. Of typer's own, nan would be told that it is too large."""
+    """An option in a range. Typer's own would refuse nan as too large."""
 
     def parsed(text: str) -> float:
         try:
@@ -37,23 +37,38 @@ simulate_app = typer.Typer(
 
 @simulate_app.command("images")
 def simulate_images(
-    out: Annotated[Path, typer.Option("--out", "-o", help="A new or empty folder.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The folder to write, new or empty.")
+    ],
     preset: Annotated[
         str,
         typer.Option(
-            help="sample: the one in datasets; small: quick; dome: behind domes; "
-            "near: 0.3 m away, ports far off and tilted."
+            help="Which dive is rendered. sample: that of the package. small: few and "
+            "small images. dome: behind domes. near: 0.3 m away, ports far off and "
+            "tilted."
         ),
     ] = "sample",
     frames: Annotated[
-        int | None, typer.Option(help="Only the first frames of the preset.")
+        int | None,
+        typer.Option(
+            help="Number of frames, the first of the preset. Default: all of them.",
+            show_default=False,
+        ),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Another floor and noise; same rig and motion."),
+        typer.Option(
+            min=0,
+            help="Seed of the floor and of the noise; rig and motion stay the same. "
+            "Default: that of the preset.",
+            show_default=False,
+        ),
     ] = None,
     clear_water: Annotated[
-        bool, typer.Option("--clear-water", help="No attenuation, no veil.")
+        bool,
+        typer.Option(
+            "--clear-water", help="Render without attenuation and without veil."
+        ),
     ] = False,
 ) -> None:
     """Render stereo pairs through their ports, with a rig file and the truth."""
@@ -76,25 +91,42 @@ def simulate_images(
 @simulate_app.command("observations")
 @interruptible()
 def simulate_observations(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .npz file to write.")],
     trajectory: Annotated[
-        Literal["rich", "strip", "lawn-mower"], typer.Option(help="How the rig moves.")
+        Literal["rich", "strip", "lawn-mower"],
+        typer.Option(help="How the rig moves over the floor."),
     ] = "rich",
-    frames: Annotated[int, typer.Option(min=2, max=100_000, help="Stereo pairs.")] = 15,
+    frames: Annotated[
+        int, typer.Option(min=2, max=100_000, help="Number of stereo pairs taken.")
+    ] = 15,
     altitude_m: Annotated[
-        float, _number(0.01, MAX_RANGE_M, "Mean height above ground.")
+        float, _number(0.01, MAX_RANGE_M, "Mean height above the floor, in metres.")
     ] = 2.0,
     relief_m: Annotated[
-        float, _number(0, MAX_RANGE_M, "Its standard deviation.")
+        float,
+        _number(0, MAX_RANGE_M, "Standard deviation of the floor's height, in metres."),
     ] = 0.2,
     points: Annotated[
-        int, typer.Option(min=1, max=10_000_000, help="Seen at least twice.")
+        int,
+        typer.Option(
+            min=1, max=10_000_000, help="Number of points, each seen at least twice."
+        ),
     ] = 800,
-    noise_px: Annotated[float, _number(0, 100, "Per image coordinate.")] = 0.5,
-    outliers: Annotated[float, _number(0, 1, "Share of the observations.")] = 0.0,
-    distance_m: Annotated[float, _number(0, 0.5, "Of both ports.")] = 0.02,
-    thickness_m: Annotated[float, _number(0, 0.5, "Of both glasses.")] = 0.005,
-    focal_px: Annotated[float, _number(100, 100_000, "Of both cameras.")] = 1000.0,
+    noise_px: Annotated[
+        float, _number(0, 100, "Standard deviation of an image coordinate, in pixels.")
+    ] = 0.5,
+    outliers: Annotated[
+        float, _number(0, 1, "Share of the observations that are wrong, 0 to 1.")
+    ] = 0.0,
+    distance_m: Annotated[
+        float, _number(0, 0.5, "Distance of both ports from their cameras, in metres.")
+    ] = 0.02,
+    thickness_m: Annotated[
+        float, _number(0, 0.5, "Thickness of the glass of both ports, in metres.")
+    ] = 0.005,
+    focal_px: Annotated[
+        float, _number(100, 100_000, "Focal length of both cameras, in pixels.")
+    ] = 1000.0,
     seed: SeedOption = 0,
 ) -> None:
     """Simulate what a stereo rig observes, with ground truth, as arrays.

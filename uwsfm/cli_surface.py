@@ -11,23 +11,24 @@ SourceArgument = Annotated[
     Path,
     typer.Argument(
         metavar="OUT_OR_CLOUD",
-        help="A result folder (its dense cloud, or its points if there is none), or a "
-        "PLY file.",
+        help="A result folder, of which the dense cloud is taken, or the points if "
+        "there is none; or a PLY file.",
     ),
 ]
 UpOption = Annotated[
     Literal["plane", "x", "y", "z", "-x", "-y", "-z"] | None,
     typer.Option(
-        help="The world's axis that points up, --up=z or --up=-z; plane: the plane "
-        "through the points is level (the default without positions).",
+        help="Axis of the world that points up, --up=z or --up=-z. plane: the plane "
+        "through the points is level. Default: plane; with positions it must be given.",
         show_default=False,
     ),
 ]
 PartsOption = Annotated[
     Literal["main", "all"],
     typer.Option(
-        help="main: the connected surface alone, and other parts with a tenth of its "
-        "points; strays go into a file of their own. all: every point."
+        help="Which points are used. main: the connected surface, and other parts with "
+        "a tenth of its points or more; strays go into a file of their own. all: every "
+        "point."
     ),
 ]
 
@@ -40,34 +41,39 @@ def clean(
         int | None,
         typer.Option(
             min=1,
-            help="Images of a track (default 3), or depth maps that agree (2).",
+            help="Least number of images of a point's track, or of depth maps that "
+            "agree on it. Default: 3 images, 2 depth maps.",
             show_default=False,
         ),
     ] = None,
     max_error_px: Annotated[
         float | None,
-        typer.Option(help="Mean reprojection error (default 2).", show_default=False),
+        typer.Option(
+            help="Largest mean reprojection error of a point, in pixels. Default: 2.",
+            show_default=False,
+        ),
     ] = None,
     max_stddev: Annotated[
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Along the line of sight (default: any).",
+            help="Largest standard deviation along the line of sight. Default: any.",
             show_default=False,
         ),
     ] = None,
     max_relative_stddev: Annotated[
         float | None,
         typer.Option(
-            help="The same, as a share of the distance (default 0.02).",
+            help="Largest standard deviation along the line of sight, as a share of "
+            "the distance. Default: 0.02.",
             show_default=False,
         ),
     ] = None,
     outlier_ratio: Annotated[
         float | None,
         typer.Option(
-            help="Standard deviations that a point may be further from its neighbours "
-            "than others from theirs (default 4).",
+            help="How much further a point may be from its neighbours than others from "
+            "theirs, in standard deviations. Default: 4.",
             show_default=False,
         ),
     ] = None,
@@ -91,19 +97,20 @@ def clean(
 
 def mesh(
     source: SourceArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write.")],
     method: Annotated[
         Literal["poisson", "ball-pivoting"],
         typer.Option(
-            help="Poisson smooths over noise, ball pivoting keeps the points."
+            help="How the surface is made. poisson: smooths over noise. ball-pivoting: "
+            "keeps the points as they are."
         ),
     ] = "poisson",
     max_distance: Annotated[
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Largest distance of the surface from the points (default: four of "
-            "their spacings); what is further is a hole.",
+            help="Largest distance of the surface from the points; what is further is "
+            "a hole. Default: four of their spacings.",
             show_default=False,
         ),
     ] = None,
@@ -126,7 +133,7 @@ def mesh(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the photographs, if they are no longer where they were.",
+            help="Folder where the photographs are now. Default: where they were.",
             show_default=False,
         ),
     ] = None,
@@ -163,10 +170,10 @@ def mesh(
     )
     written = "mesh.ply, mesh.obj, mesh.glb, web.glb, mesh.json"
     if texture:
-        told = report["texture"]
+        texel = report["texture"]
         typer.echo(
-            f"texture: {told['width']} x {told['height']} from {told['num_images']} "
-            f"images, which see {told['share_seen']:.0%} of the surface"
+            f"texture: {texel['width']} x {texel['height']} from {texel['num_images']} "
+            f"images, which see {texel['share_seen']:.0%} of the surface"
         )
         written += ", textured.glb"
     for warning in report["warnings"]:
@@ -177,13 +184,13 @@ def mesh(
 @interruptible()
 def map_(
     source: SourceArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write.")],
     up: UpOption = None,
     resolution: Annotated[
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Side of a cell (default: the spacing of the points).",
+            help="Side of a cell of the map. Default: the spacing of the points.",
             show_default=False,
         ),
     ] = None,
@@ -191,8 +198,8 @@ def map_(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Distance between points that is filled where the surface is smooth "
-            "(default: five spacings); what is wider stays a hole.",
+            help="Distance between points that is filled where the surface is smooth; "
+            "what is wider stays a hole. Default: five spacings.",
             show_default=False,
         ),
     ] = None,
@@ -223,28 +230,34 @@ def color(
     model: Annotated[
         Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write.")],
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the images, if they are no longer where they were.",
+            help="Folder where the images are now. Default: where they were.",
             show_default=False,
         ),
     ] = None,
     write_images: Annotated[
         bool,
-        typer.Option("--write-images", help="Write the images without water, too."),
+        typer.Option(
+            "--write-images", help="Write the images without the water's colour, too."
+        ),
     ] = False,
     encoding: Annotated[
         Literal["srgb", "sqrt", "linear"],
         typer.Option(
-            help="How light became numbers: srgb: cameras' JPEG; sqrt: uwsfm simulate; "
-            "linear: developed without a curve."
+            help="How light became the numbers of the images. srgb: as in a camera's "
+            "JPEG. sqrt: as uwsfm simulate writes them. linear: developed without a "
+            "curve."
         ),
     ] = "srgb",
     white_balance: Annotated[
         Literal["none", "gray"],
-        typer.Option(help="gray: the median point becomes grey."),
+        typer.Option(
+            help="Which colour becomes grey. none: no colour is changed for it. gray: "
+            "that of the median point."
+        ),
     ] = "none",
 ) -> None:
     """Estimate what the water does to colours, and take it from points and images.

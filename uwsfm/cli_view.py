@@ -8,7 +8,7 @@ import typer
 from uwsfm._signals import interruptible
 
 OutArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", help="A result folder of uwsfm.")
+    Path, typer.Argument(metavar="OUT", help="The result folder of a run.")
 ]
 
 
@@ -33,13 +33,16 @@ def view(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Where the images are now (--rerun); default: where they were.",
+            help="Folder where the images are now, with --rerun. Default: where they "
+            "were.",
             show_default=False,
         ),
     ] = None,
     open_: Annotated[
         bool,
-        typer.Option("--open/--no-open", help="Open it, or only tell where it is."),
+        typer.Option(
+            "--open/--no-open", help="Open the page or the recording once it is there."
+        ),
     ] = True,
 ) -> None:
     """Open the 3-D view of a report in the browser, or a recording in Rerun."""

@@ -40,7 +40,7 @@ class ProgressBars:
     A signal is an exception from its start on: what takes long to import comes after.
 
     Args:
-        left: what is told if the command is interrupted.
+        left: the sentence that an interruption ends with.
     """
 
     def __init__(self, left: str = RESUMES) -> None:

@@ -7,7 +7,7 @@ from uwsfm._progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.evaluate import Comparison, compare_with_truth
 from uwsfm.pipeline import ReconstructResult, reconstruct
-from uwsfm.sfm.options import Mapper
+from uwsfm.sfm.options import Mapper, StartOptions
 
 MAX_FEATURES = 4096
 """The texture of the sample is dense: twice as many would take a first look twice as
@@ -31,7 +31,9 @@ def sample_dir() -> Path:
 
 
 def run_demo(
-    out: str | Path, mapper: Mapper = "refractive", progress: Progress = silent
+    out: str | Path,
+    mapper: Mapper = StartOptions.mapper,
+    progress: Progress = silent,
 ) -> tuple[ReconstructResult, Comparison]:
     """Reconstruct the sample into ``out``, and compare with its truth."""
     sample = sample_dir()

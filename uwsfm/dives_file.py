@@ -21,57 +21,62 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError, create_model
 
+from uwsfm._options import Option, options_of
 from uwsfm._yaml import read_yaml
 from uwsfm.errors import InputError
+from uwsfm.job_options import JobOptions, ReconstructOptions
 from uwsfm.rig_problems import first_problem
 from uwsfm.rig_schema import AccuracyEntry, Entry
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[_Number, Field(gt=0)]
-_Arm = Annotated[tuple[_Number, ...], Field(strict=False, min_length=3, max_length=3)]
-_Refined = Literal["water-index", "focal", "principal-point", "distortion"]
 
-PATHS = ("masks", "positions", "lengths")
+
+def options_entry(kind: type[JobOptions]) -> type[Entry]:
+    """The keys of a block of options, and what their values may be."""
+    keys: dict[str, Any] = {
+        item.name: (_annotation(item) | None, None)
+        for item in options_of(kind)
+        if item.declared.per_dive
+    }
+    return create_model("OptionsEntry", __base__=Entry, **keys)
+
+
+def _annotation(item: Option) -> Any:
+    """What pydantic takes for an option; its lists are YAML's, and not tuples."""
+    declared = item.declared
+    if item.is_mapping:
+        keys: dict[str, Any] = {
+            key: (Annotated[_Number, Field(gt=0)] | None, None) for key in declared.keys
+        }
+        return create_model(item.name, __base__=AccuracyEntry, **keys)
+    if item.is_list:
+        return Annotated[item.type, Field(strict=False)]
+    if item.is_vector:
+        three = Field(strict=False, min_length=3, max_length=3)
+        return Annotated[tuple[_Number, ...], three]
+    if item.type is Path:
+        return str
+    if item.type not in (int, float):
+        return item.type
+    low = 0 if declared.positive else None
+    bounds = Field(gt=low, ge=declared.minimum, le=declared.maximum)
+    return Annotated[_Number if item.type is float else int, bounds]
+
+
+if TYPE_CHECKING:
+    OptionsEntry: TypeAlias = Entry
+else:
+    OptionsEntry = options_entry(ReconstructOptions)
 
 
 def _one_name(name: str) -> str:
     if not name or name in (".", "..") or set(name) & set("/\\"):
         raise ValueError("must be the name of a folder")
     return name
-
-
-class PriorEntry(AccuracyEntry):
-    distance_stddev_m: _Positive | None = None
-    normal_stddev_deg: _Positive | None = None
-    center_stddev_m: _Positive | None = None
-    water_index_stddev: _Positive | None = None
-    focal_stddev: _Positive | None = None
-    principal_point_stddev_px: _Positive | None = None
-    distortion_stddev: _Positive | None = None
-
-
-class OptionsEntry(Entry):
-    """As of `uwsfm reconstruct`; None: its default."""
-
-    clahe: bool | None = None
-    max_features: Annotated[int, Field(ge=100)] | None = None
-    masks: str | None = None
-    matching: Literal["auto", "exhaustive", "sequential"] | None = None
-    matcher: Literal["colmap", "paper"] | None = None
-    mapper: Literal["pinhole", "refractive"] | None = None
-    positions: str | None = None
-    lever_arm: _Arm | None = None
-    lengths: str | None = None
-    scene_distance_m: _Positive | None = None
-    refine: Annotated[tuple[_Refined, ...], Field(strict=False)] | None = None
-    prior: PriorEntry | None = None
-    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
-    submap_frames: Annotated[int, Field(ge=10)] | None = None
-    report: bool | None = None
 
 
 class DiveEntry(Entry):
@@ -88,11 +93,22 @@ class DivesFile(Entry):
     dives: Annotated[tuple[DiveEntry, ...], Field(strict=False)]
 
 
+def _blocks(entry: type[Entry]) -> dict[str, type[Entry]]:
+    """The blocks of keys within a block of keys, by their key."""
+    fields = entry.model_fields.items()
+    inner = {name: get_args(field.annotation)[0] for name, field in fields}
+    return {
+        name: kind
+        for name, kind in inner.items()
+        if isinstance(kind, type) and issubclass(kind, Entry)
+    }
+
+
 ENTRIES: dict[str, type[Entry]] = {
     "": DivesFile,
     "options": OptionsEntry,
-    "prior": PriorEntry,
     "dives": DiveEntry,
+    **_blocks(OptionsEntry),
 }
 
 
@@ -104,8 +120,7 @@ class Dive:
     rig: Path
     images: Path
     out: Path
-    options: dict[str, Any]
-    """Keyword arguments of `uwsfm.reconstruct`."""
+    options: ReconstructOptions
 
 
 def load_dives(path: str | Path) -> list[Dive]:
@@ -124,7 +139,13 @@ def load_dives(path: str | Path) -> list[Dive]:
     if not found.dives:
         raise InputError(f"{path}: dives: there is none in the list")
     folder = path.absolute().parent
-    dives = [_dive(entry, found.options, folder) for entry in found.dives]
+    dives = []
+    for index, entry in enumerate(found.dives):
+        try:
+            dives.append(_dive(entry, found.options, folder))
+        except InputError as error:  # options that exclude each other
+            where = f"dives[{index}].options"
+            raise InputError(f"{path}: {where}: {error}") from None
     _once(path, "name", dives, lambda dive: dive.name)
     # Two spellings of one folder are one folder.
     _once(path, "out", dives, lambda dive: os.path.realpath(dive.out))
@@ -137,18 +158,15 @@ def _dive(entry: DiveEntry, common: OptionsEntry, folder: Path) -> Dive:
         **common.model_dump(exclude_none=True),
         **entry.options.model_dump(exclude_none=True),
     }
-    for what in given.pop("refine", ()):
-        given[f"refine_{what.replace('-', '_')}"] = True
-    given.update(given.pop("prior", {}))
-    for name in PATHS:
-        if name in given:
-            given[name] = folder / given[name]
+    for item in options_of(ReconstructOptions):
+        if item.type is Path and item.name in given:
+            given[item.name] = folder / given[item.name]
     return Dive(
         name=entry.name,
         rig=folder / entry.rig,
         images=folder / entry.images,
         out=folder / (entry.name if entry.out is None else entry.out),
-        options=given,
+        options=ReconstructOptions.of(**given),
     )
 
 

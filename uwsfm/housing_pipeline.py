@@ -1,13 +1,13 @@
 """Housing calibration from images or from a COLMAP model: the housing, and no cloud."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from uwsfm._options import options_of
 from uwsfm._progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.error_budget import BudgetRow
@@ -23,10 +23,12 @@ from uwsfm.export.summary import (
     versions,
     write_json,
 )
-from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.job_checks import at_scene_distance, checked_rig, require_effect
 from uwsfm.job_log import job_log
+from uwsfm.job_options import CalibrateHousingOptions
 from uwsfm.judgement import Judgement, judged_result
 from uwsfm.known_lengths import KnownLengths
+from uwsfm.options_file import OPTIONS, write_options
 from uwsfm.output_folder import (
     WORK,
     locked,
@@ -35,12 +37,12 @@ from uwsfm.output_folder import (
     require_elsewhere,
 )
 from uwsfm.pipeline import compiled, refined_rig, start_scene
+from uwsfm.report.command import command_line
 from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import find_model
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.model_start import ModelStart, start_from_model
-from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.refine import rig_options, within_valid_radius
 from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.start import match_images, perspective_start
@@ -50,8 +52,6 @@ from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
-
-Start = Literal["virtual", "paper", "pairs"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,15 +72,10 @@ def calibrate_housing(
     rig: Rig | str | Path,
     source: str | Path,
     out: str | Path,
+    options: CalibrateHousingOptions | None = None,
     *,
-    start: Start = "virtual",
-    front_end: StartOptions | None = None,
-    positions: str | Path | None = None,
-    lever_arm: ArrayLike | None = None,
-    lengths: str | Path | None = None,
-    scene_distance_m: float | None = None,
     progress: Progress = silent,
-    **options: Any,
+    **settings: object,
 ) -> HousingResult:
     """Calibrate the ports of a rig from images, or from a COLMAP model of them.
 
@@ -88,35 +83,51 @@ def calibrate_housing(
         rig: a rig, or the path of a rig file; its ports are the initial values.
         source: folder of images as for `reconstruct`, a COLMAP model whose images are
             in the rig's folders, or the output folder of `reconstruct`.
-        out: receives ``housing.yaml`` and ``calibration.json``.
-        start: "virtual": pinholes fitted to the initial ports; "paper": adjusted with
-            pinholes of 1.333 f and radial distortion besides (section 3.2.2);
-            "pairs": matches between the cameras of one frame only, with rig and
-            distances as given (section 3.2.1). One frame alone is "pairs".
-        front_end: how features are found and matched, and which mapper finds the
-            start; see `uwsfm.StartOptions`.
-        positions, lever_arm, lengths, scene_distance_m: as in `reconstruct`.
+        out: receives ``housing.yaml``, ``calibration.json`` and ``options.yaml``.
+        options: how; None: the defaults. One stereo pair starts from "pairs".
         progress: called with each long step.
-        **options: fields of `CalibrateOptions`.
+        **settings: options by name, in place of those of ``options``; ``front_end``
+            for a whole `StartOptions`; and fields of `CalibrateOptions`.
 
     Raises:
         InputError: the rig, the source, an option or the output folder is not usable;
             or a port distance is asked of single stereo pairs.
         UwsfmError: the images could not be reconstructed; the message says why.
     """
-    asked = {**locals()}
+    options = (options or CalibrateHousingOptions()).with_settings(settings)
+    command = command_line("calibrate", (rig, source), out, options)
+    asked = {"rig": rig, "source": source, "out": out, **options.values()}
     made_of = made_of_files(rig, source)
-    rig = checked_rig(rig)
-    if start not in get_args(Start):
-        raise InputError(
-            f"start must be one of {', '.join(get_args(Start))}, got {start!r}"
-        )
-    merged = {**rig_options(rig), **options}
+    rig, known = checked_rig(rig), options.constraints
+    job = _Job(
+        rig=rig,
+        source=Path(source),
+        out=Path(out),
+        options=at_scene_distance(options, rig),
+        lengths=KnownLengths.read(known.lengths, known.positions, known.lever_arm),
+        made_of=made_of,
+        progress=progress,
+    )
     # A wrong option fails before anything is written.
-    require_effect(CalibrateOptions.parsed(merged))
-    known = KnownLengths.read(lengths, positions, lever_arm)
+    require_effect(job.adjusted)
     require_elsewhere(out, source)
-    source, out = Path(source), output_folder(out, made_of=made_of)
+    _require_place(job.source, output_folder(out, made_of=made_of))
+    model = find_model(job.source)
+    if model is None:
+        start = None
+        job = job.from_images()
+    else:
+        job.require_model_options()
+        start = start_from_model(model, rig, job.options.front_end.scene_distance_m)
+        job.lengths.check_names(rig, start.tracks.frame_names)
+    with locked(job.out), job_log(job.out, command, asked, progress) as log:
+        result = replace(job, progress=log.progress).run(start)
+        log.result(result.summary)
+        return result
+
+
+def _require_place(source: Path, out: Path) -> None:
+    """Refuse a source that is neither images nor a model, and results of other jobs."""
     if source.suffix == ".npz" and source.is_file():
         raise InputError(
             f"{source} holds arrays, and neither images nor a model: observations are "
@@ -128,49 +139,6 @@ def calibrate_housing(
             f"{out} holds a reconstruction, whose housing this would replace: choose "
             "another folder"
         )
-    found = find_model(source)
-    front_end = front_end or StartOptions()
-    if scene_distance_m is not None:
-        distance_m = scene_distance(rig, scene_distance_m)
-        front_end = replace(front_end, scene_distance_m=distance_m)
-    job = _Job(
-        rig=rig,
-        source=source,
-        out=out,
-        start=start,
-        front_end=front_end,
-        known=known,
-        made_of=made_of,
-        progress=progress,
-        options=merged,
-    )
-    _require_front_end_effect(front_end, model=found is not None)
-    if found is None:
-        frames = find_frames(source, rig, min_num_frames=1)
-        known.check_names(rig, frames.names)
-        if start == "pairs" or len(frames.names) == 1:
-            _require_distances_held(rig, merged, len(frames.names))
-            job = replace(job, start="pairs")
-            if front_end.mapper != StartOptions().mapper:
-                raise InputError(
-                    f"mapper {front_end.mapper!r} has no effect: single stereo pairs "
-                    "are not mapped"
-                )
-            if known.given:
-                raise InputError(
-                    "single stereo pairs tell normals only: lengths and positions have "
-                    "no effect"
-                )
-    elif start == "pairs":
-        raise InputError(f"{source} is a model: start 'pairs' works from images")
-    model = None
-    if found is not None:
-        model = start_from_model(found, rig, front_end.scene_distance_m)
-        known.check_names(rig, model.tracks.frame_names)
-    with locked(out), job_log(out, "uwsfm calibrate", asked, progress) as log:
-        result = replace(job, progress=log.progress).run(model)
-        log.result(result.summary)
-        return result
 
 
 @dataclass(frozen=True)
@@ -180,16 +148,60 @@ class _Job:
     rig: Rig
     source: Path
     out: Path
-    start: Start
-    front_end: StartOptions
-    known: KnownLengths
+    options: CalibrateHousingOptions
+    lengths: KnownLengths
     made_of: dict[str, str | None]
     progress: Progress
-    options: Mapping[str, Any]
+
+    @property
+    def adjusted(self) -> dict[str, Any]:
+        """Fields of `CalibrateOptions`: of the rig file, and those that were asked."""
+        return {
+            **rig_options(self.rig),
+            "strategy": self.options.strategy,
+            "error": self.options.error,
+            **self.options.adjustment.as_fields(),
+        }
+
+    def from_images(self) -> "_Job":
+        """The job as the images allow it: one frame can only be a single pair.
+
+        Raises:
+            InputError: images are missing, or an option has no effect on them.
+        """
+        self.options.front_end.features.require_masks()
+        frames = find_frames(self.source, self.rig, min_num_frames=1)
+        self.lengths.check_names(self.rig, frames.names)
+        if self.options.start != "pairs" and len(frames.names) > 1:
+            return self
+        _require_distances_held(self.rig, self.adjusted, len(frames.names))
+        self._require_unused(_MAPPING, "single stereo pairs are not mapped")
+        if self.lengths.given:
+            raise InputError(
+                "lengths and positions have no effect: single stereo pairs determine "
+                "normals only"
+            )
+        return replace(self, options=replace(self.options, start="pairs"))
+
+    def require_model_options(self) -> None:
+        """Refuse what is asked of images, for a COLMAP model is the source."""
+        if self.options.start == "pairs":
+            raise InputError(f"{self.source} is a model: start 'pairs' needs images")
+        self._require_unused(
+            (*_MATCHING, *_MAPPING),
+            "a COLMAP model is the start, and no image is read; leave this option out, "
+            "or give the folder of the images",
+        )
+
+    def _require_unused(self, names: Container[str], why: str) -> None:
+        """Refuse options, by name, that are not at their defaults."""
+        for item, value in self.options.items():
+            if item.name in names and value != item.default:
+                raise InputError(f"{item.label} has no effect: {why}")
 
     def run(self, model: ModelStart | None) -> HousingResult:
-        compiled(self.front_end.threads, self.progress)
-        if self.start == "pairs":
+        compiled(self.options.front_end.threads, self.progress)
+        if self.options.start == "pairs":
             calibration = self._from_pairs()
             count = calibration.scene.num_frames
             seen = len(np.unique(calibration.scene.frame_idx[calibration.inliers]))
@@ -200,14 +212,19 @@ class _Job:
             else:
                 scene, names = model.tracks.scene, model.tracks.frame_names
                 num_frames = len(names)
-            if self.start == "paper":
+            if self.options.start == "paper":
                 scene = self._paper_start(scene)
-            scene, lengths = self.known.placed(self.rig, names, scene)
-            options = {"lengths": lengths, **self.options}
+            scene, lengths = self.lengths.placed(self.rig, names, scene)
             # What is given is given of the rig file's ports, not of the map's.
             known = replace(scene, cameras=self.rig.refractive_cameras())
             refined = refined_or_explained(
-                scene, self.rig, names, self.progress, known=known, **options
+                scene,
+                self.rig,
+                names,
+                self.progress,
+                known=known,
+                lengths=lengths,
+                **self.adjusted,
             )
             calibration, used = refined.calibration, used_of(refined, num_frames)
         judged = judged_result(
@@ -215,7 +232,7 @@ class _Job:
             calibration,
             used,
             self.progress,
-            in_halves=self._reprojects and self.start != "pairs",
+            in_halves=self._reprojects and self.options.start != "pairs",
             has_model=False,
         )
         return self._finish(judged, () if model is None else model.warnings)
@@ -223,13 +240,14 @@ class _Job:
     @property
     def _reprojects(self) -> bool:
         """Whether it is the joint adjustment of pixels, which takes little time."""
-        options = CalibrateOptions.parsed(dict(self.options))
+        options = CalibrateOptions.parsed(self.adjusted)
         return options.strategy == "joint" and options.error_name == "reprojection"
 
     def _from_images(self) -> tuple[Scene, Sequence[str], int]:
         """The start, the names of its frames, and how many frames there were."""
+        front_end = self.options.front_end
         start = perspective_start(
-            self.rig, self.source, self.out / WORK, self.front_end, self.progress
+            self.rig, self.source, self.out / WORK, front_end, self.progress
         )
         arrays = start.arrays()
         scene = start_scene(self.rig, start, arrays)
@@ -256,19 +274,20 @@ class _Job:
         frames = find_frames(self.source, self.rig, min_num_frames=1)
         space = Workspace(work_dir=self.out / WORK)
         steps = Steps(space.work_dir)
-        match_images(self.rig, frames, steps, space, self.front_end, self.progress)
+        front_end = self.options.front_end
+        match_images(self.rig, frames, steps, space, front_end, self.progress)
         scene = same_frame_scene(self.rig, frames, space.features)
-        options = {**self.options, **PAIRS_HOLD}
+        options = {**self.adjusted, **PAIRS_HOLD}
         first = calibrate(scene, **options)
         found = without_wrong_matches(replace(scene, cameras=first.scene.cameras))
         return calibrate(found, known=scene, **options)
 
     def _notes(self) -> list[str]:
         """What was taken for granted, one sentence each."""
-        if self.start != "pairs":
+        if self.options.start != "pairs":
             return []
         return [
-            "single stereo pairs tell the normals only: cam_from_rig and the port "
+            "single stereo pairs determine the normals only: cam_from_rig and the port "
             "distances were taken as given"
         ]
 
@@ -279,7 +298,7 @@ class _Job:
         summary = {
             "strategy": calibration.options.strategy,
             "error": calibration.options.error_name,
-            "start": self.start,
+            "start": self.options.start,
             **errors_summary(calibration),
             "cameras": housing_summary(rig, calibration),
             "refined": refined_summary(rig, calibration),
@@ -288,7 +307,7 @@ class _Job:
             "versions": versions(),
         }
         summary = judged.added_to(summary, rig)
-        if self.start != "pairs":  # single pairs hold what most mistakes show in
+        if self.options.start != "pairs":  # which hold what most mistakes show in
             causes = explain(
                 judged.word,
                 judged.verdict.codes,
@@ -298,6 +317,7 @@ class _Job:
             )
             summary["explanations"] = [one.to_json() for one in causes]
         export_housing(rig, self.out / HOUSING, calibration, verdict=judged.word)
+        write_options(self.options, self.out / OPTIONS)
         write_json(summary, self.out / HOUSING_SUMMARY)
         return HousingResult(
             rig=rig,
@@ -309,21 +329,14 @@ class _Job:
 
 
 PAIRS_HOLD = {"refine_distances": False, "refine_cam_from_rig": False}
-"""What single stereo pairs cannot tell."""
-
-
-def _require_front_end_effect(front_end: StartOptions, *, model: bool) -> None:
-    """Refuse options of the front end that a COLMAP model leaves without an effect."""
-    options, defaults = front_end, StartOptions()
-    for name, changed in (
-        ("mapper", options.mapper != defaults.mapper),
-        ("matcher", options.matching.matcher != defaults.matching.matcher),
-    ):
-        if model and changed:
-            raise InputError(
-                f"{name} has no effect: a COLMAP model is the start, and no image is "
-                "read; leave this option out, or give the folder of the images"
-            )
+"""What single stereo pairs do not determine."""
+_MATCHING = tuple(
+    item.name
+    for item in options_of(CalibrateHousingOptions)
+    if item.path[:2] in (("front_end", "features"), ("front_end", "matching"))
+)
+_MAPPING = ("submap_frames", "mapper", "scheduler")
+"""Options of the front end, by name; seed and threads are of other steps, too."""
 
 
 def _require_distances_held(

@@ -1,14 +1,20 @@
 """What a job checks before it reads an image: the rig, and options without effect."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.errors import InputError
+from uwsfm.job_options import CalibrateHousingOptions, ReconstructOptions
 from uwsfm.rig import Rig
 from uwsfm.rig_file import load_rig
 from uwsfm.trust.reason import DOES_NOT_FIT
+
+FromImages = TypeVar("FromImages", ReconstructOptions, CalibrateHousingOptions)
 
 
 def checked_rig(rig: Rig | str | Path) -> Rig:
@@ -36,10 +42,10 @@ def checked_rig(rig: Rig | str | Path) -> Rig:
 
 
 def scene_distance(rig: Rig, given_m: float | None) -> float:
-    """How far away the scene of a single camera is, about, metres; 1 if nobody knows.
+    """Rough distance of a single camera's scene, metres; 1 if none is given.
 
     Raises:
-        InputError: it is not positive, or the rig has a baseline, which tells.
+        InputError: the rig has a baseline, which determines it.
     """
     if given_m is None:
         return 1.0
@@ -48,16 +54,34 @@ def scene_distance(rig: Rig, given_m: float | None) -> float:
             "--scene-distance (scene_distance_m) has no effect: the baseline of the "
             "rig gives the scale; leave this option out"
         )
-    if not 0.0 < given_m < np.inf:
-        raise InputError(
-            "--scene-distance (scene_distance_m) must be positive and finite, "
-            f"got {given_m}"
-        )
     return given_m
 
 
-def require_effect(options: CalibrateOptions) -> None:
-    """Refuse what is known of a number that is not refined."""
+def at_scene_distance(options: FromImages, rig: Rig) -> FromImages:
+    """Options whose front end begins at the distance of the scene that is given.
+
+    Raises:
+        InputError: as `scene_distance`.
+    """
+    given_m = options.constraints.scene_distance_m
+    if given_m is None:
+        return options
+    front_end = replace(
+        options.front_end, scene_distance_m=scene_distance(rig, given_m)
+    )
+    return replace(options, front_end=front_end)
+
+
+def require_effect(fields: Mapping[str, Any]) -> None:
+    """Refuse what is known of a number that is not refined.
+
+    Args:
+        fields: of `CalibrateOptions`, by name.
+
+    Raises:
+        InputError: one has no effect, or `CalibrateOptions` refuses it.
+    """
+    options = CalibrateOptions.parsed(dict(fields))
     refined = {
         "distance_stddev_m": ("the distance of a port", options.refine_distances),
         "normal_stddev_deg": ("the normal of a port", options.refine_normals),

@@ -23,12 +23,24 @@ from uwsfm.export.files import (
     read_summary,
 )
 from uwsfm.job_log import LOG
+from uwsfm.options_file import OPTIONS
 from uwsfm.report.files import FOLDER, PAGE
 from uwsfm.result_folder import read_told
 from uwsfm.sfm.steps import FILE_NAME as STEPS_FILE
 
 LOCK = "lock"
-RESULTS = (SPARSE, HOUSING, RIG_GIVEN, POINTS, CALIBRATION, SUMS, SUMMARY, PAGE, FOLDER)
+RESULTS = (
+    SPARSE,
+    HOUSING,
+    RIG_GIVEN,
+    OPTIONS,
+    POINTS,
+    CALIBRATION,
+    SUMS,
+    SUMMARY,
+    PAGE,
+    FOLDER,
+)
 """What a run writes."""
 
 

@@ -1,16 +1,14 @@
 """The main job: images and a rig in, a metric refractive model out."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.export.files import (
     HOUSING,
@@ -30,10 +28,12 @@ from uwsfm.export.summary import (
     versions,
 )
 from uwsfm.first_run import compile_kernels
-from uwsfm.job_checks import checked_rig, require_effect, scene_distance
+from uwsfm.job_checks import at_scene_distance, checked_rig, require_effect
 from uwsfm.job_log import job_log
+from uwsfm.job_options import ReconstructOptions
 from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
+from uwsfm.options_file import OPTIONS, write_options
 from uwsfm.output_folder import WORK, locked, made_of_files, output_folder
 from uwsfm.report.command import command_line
 from uwsfm.report.files import write_with_report
@@ -42,20 +42,11 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colors import stored_point_colors
 from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.options import (
-    FeatureOptions,
-    Mapper,
-    MappingOptions,
-    Matcher,
-    Matching,
-    MatchOptions,
-    StartOptions,
-)
 from uwsfm.sfm.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.tasks import LOCAL, Workers
+from uwsfm.tasks import Workers
 from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
@@ -80,24 +71,10 @@ def reconstruct(
     rig: Rig | str | Path,
     images: str | Path,
     out: str | Path,
+    options: ReconstructOptions | None = None,
     *,
-    clahe: bool = False,
-    max_features: int | None = None,
-    masks: str | Path | None = None,
-    matching: Matching = "auto",
-    matcher: Matcher = "colmap",
-    mapper: Mapper = "refractive",
-    positions: str | Path | None = None,
-    lever_arm: ArrayLike | None = None,
-    lengths: str | Path | None = None,
-    scene_distance_m: float | None = None,
-    seed: int = 0,
-    num_threads: int = -1,
-    submap_frames: int | None = None,
-    scheduler: str = LOCAL,
-    report: bool = True,
     progress: Progress = silent,
-    **calibration: Any,
+    **settings: object,
 ) -> ReconstructResult:
     """Reconstruct a dive: features, a map, the refractive optimum, files.
 
@@ -109,59 +86,31 @@ def reconstruct(
         rig: A rig, or the path of a rig file.
         images: Folder that holds one folder of images per camera.
         out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply``,
-            ``calibration.npz`` and ``summary.json``, each replaced as a whole;
-            `uwsfm.open_result` reads it.
-        clahe: Equalise contrast locally before the search for features.
-        max_features: Features per image, about; None: by the size of the images.
-        masks: Folder of masks in COLMAP's naming.
-        matching: "exhaustive", "sequential", or "auto" by the number of frames.
-        matcher: "colmap", or "paper": kd-trees and a tolerant fundamental matrix.
-        mapper: "refractive": water rays in every step; "pinhole": COLMAP's, with
-            pinholes fitted to the ports.
-        positions: CSV of positions of the frames, see `uwsfm.lengths_file`; the result
-            is in their frame.
-        lever_arm: (3,) of the antenna they are of, in the rig, metres.
-        lengths: YAML file of scale bars and distances between frames, see there.
-        scene_distance_m: Of a single camera, about; None: 1. Two or more measure it.
-        seed: Of all random choices.
-        num_threads: -1 for all cores; as many processes map the parts of a survey.
-        submap_frames: A survey of more frames is mapped in parts of at most so many,
-            which are merged; None: in parts of 200 beyond 400.
-        scheduler: Who maps the parts: "local", or the address of a Dask scheduler whose
-            workers see ``images`` and ``out`` under the same paths.
-        report: False: no ``report.html``, which takes a second or two.
+            ``calibration.npz``, ``options.yaml`` and ``summary.json``, each replaced as
+            a whole; `uwsfm.open_result` reads it.
+        options: How; None: the defaults.
         progress: Called with each long step.
-        **calibration: Fields of `CalibrateOptions`, of the last adjustment.
+        **settings: Options by name, as ``max_features=4000``, in place of those of
+            ``options``; and fields of `CalibrateOptions`, for the last adjustment.
 
     Raises:
         InputError: An option, the rig file, images or output folder are not usable.
         UwsfmError: The images could not be reconstructed; the message says why.
     """
-    asked = {**locals()}
-    command = command_line("reconstruct", reconstruct, asked)
+    options = (options or ReconstructOptions()).with_settings(settings)
+    command = command_line("reconstruct", (rig, images), out, options)
+    asked = {"rig": rig, "images": images, "out": out, **options.values()}
     rig_source, rig = rig, checked_rig(rig)
-    require_effect(CalibrateOptions.parsed({**rig_options(rig), **calibration}))
+    require_effect({**rig_options(rig), **options.adjustment.as_fields()})
     made_of = made_of_files(rig_source, images)
     out = output_folder(out, images, made_of)
-    options = StartOptions(
-        features=FeatureOptions(
-            clahe=clahe,
-            max_num_features=max_features,
-            mask_dir=None if masks is None else Path(masks),
-        ),
-        matching=MatchOptions(strategy=matching, matcher=matcher),
-        mapping=MappingOptions(submap_frames=submap_frames),
-        mapper=mapper,
-        scene_distance_m=scene_distance(rig, scene_distance_m),
-        seed=seed,
-        num_threads=num_threads,
-        scheduler=scheduler,
-    )
+    options, known = at_scene_distance(options, rig), options.constraints
     # Wrong folders and files fail before anything is written.
+    options.front_end.features.require_masks()
     frames = find_frames(Path(images), rig)
-    known = KnownLengths.read(lengths, positions, lever_arm)
-    known.check_names(rig, frames.names)
-    with Workers(scheduler):  # whether a scheduler answers, and has a worker
+    lengths = KnownLengths.read(known.lengths, known.positions, known.lever_arm)
+    lengths.check_names(rig, frames.names)
+    with Workers(options.front_end.scheduler):  # whether it answers, and has a worker
         pass
     with locked(out), job_log(out, command, asked, progress) as log:
         job = _Job(
@@ -169,11 +118,9 @@ def reconstruct(
             images=Path(images),
             out=out,
             options=options,
-            known=known,
-            calibration=calibration,
-            command=command,
+            known=lengths,
             made_of=made_of,
-            report=report,
+            command=command,
             progress=log.progress,
         )
         result = job.run()
@@ -188,19 +135,17 @@ class _Job:
     rig: Rig
     images: Path
     out: Path
-    options: StartOptions
+    options: ReconstructOptions
     known: KnownLengths
-    calibration: Mapping[str, Any]
     command: str | None
     made_of: dict[str, str | None]
-    report: bool
     progress: Progress
 
     def run(self) -> ReconstructResult:
-        out = self.out
-        timings = compiled(self.options.threads, self.progress)
+        out, front_end = self.out, self.options.front_end
+        timings = compiled(front_end.threads, self.progress)
         start = perspective_start(
-            self.rig, self.images, out / WORK, self.options, self.progress
+            self.rig, self.images, out / WORK, front_end, self.progress
         )
         timings.update(start.summary["timings_s"])
         clock = time.perf_counter()
@@ -216,6 +161,7 @@ class _Job:
         export_colmap(model, out / SPARSE)
         export_housing(model.rig, out / HOUSING, calibration, verdict=judged.word)
         export_given_rig(self.rig, out / RIG_GIVEN)
+        write_options(self.options, out / OPTIONS)
         export_points(model, out / POINTS, calibration)
         store_calibration(judged.solved, out)
         timings["colours and export"] = time.perf_counter() - clock
@@ -235,8 +181,9 @@ class _Job:
         )
         summary["explanations"] = [one.to_json() for one in causes]
         timings["looking for the cause"] = time.perf_counter() - clock
+        wanted = self.options.report
         write_with_report(
-            out, model, calibration, summary, self.progress, wanted=self.report
+            out, model, calibration, summary, self.progress, wanted=wanted
         )
         return ReconstructResult(
             model=model,
@@ -258,7 +205,7 @@ class _Job:
             self.progress,
             known=known,
             lengths=lengths,
-            **self.calibration,
+            **self.options.adjustment.as_fields(),
         )
 
 

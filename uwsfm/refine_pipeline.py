@@ -7,19 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from uwsfm._progress import Progress, silent
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.colmap import Model
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.export.files import (
-    HOUSING,
-    POINTS,
-    RIG_GIVEN,
-    SPARSE,
-    export_colmap,
-)
+from uwsfm.export.files import HOUSING, POINTS, RIG_GIVEN, SPARSE, export_colmap
 from uwsfm.export.housing import export_given_rig, export_housing
 from uwsfm.export.summary import (
     errors_summary,
@@ -30,9 +24,11 @@ from uwsfm.export.summary import (
 )
 from uwsfm.job_checks import checked_rig, require_effect, scene_distance
 from uwsfm.job_log import job_log
+from uwsfm.job_options import RefineOptions
 from uwsfm.judgement import judged_result
 from uwsfm.known_lengths import KnownLengths
 from uwsfm.models.port import FlatPort
+from uwsfm.options_file import OPTIONS, write_options
 from uwsfm.output_folder import locked, made_of_files, output_folder, require_elsewhere
 from uwsfm.pipeline import compiled, export_points, refined_rig
 from uwsfm.report.command import command_line
@@ -42,19 +38,11 @@ from uwsfm.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.colmap_model import FoundModel, find_model
 from uwsfm.sfm.colors import point_colors
-from uwsfm.sfm.model_database import (
-    ImageDatabase,
-    read_image_database,
-    with_database,
-)
+from uwsfm.sfm.model_database import ImageDatabase, read_image_database, with_database
 from uwsfm.sfm.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.pixels import image_fault
-from uwsfm.sfm.refine import (
-    Refined,
-    rig_options,
-    without_empty_frames,
-)
+from uwsfm.sfm.refine import Refined, rig_options, without_empty_frames
 from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
@@ -91,16 +79,10 @@ def refine_model(
     source: str | Path,
     rig: Rig | str | Path,
     out: str | Path,
+    options: RefineOptions | None = None,
     *,
-    images: str | Path | None = None,
-    database: str | Path | None = None,
-    scene_distance_m: float | None = None,
-    positions: str | Path | None = None,
-    lever_arm: ArrayLike | None = None,
-    lengths: str | Path | None = None,
-    report: bool = True,
     progress: Progress = silent,
-    **options: Any,
+    **settings: object,
 ) -> RefineResult:
     """Turn a COLMAP model of underwater images into the refractive one.
 
@@ -114,70 +96,69 @@ def refine_model(
             the largest is taken.
         rig: A rig, or the path of a rig file; its ports are the initial values.
         out: Receives ``sparse/`` (COLMAP), ``housing.yaml``, ``points.ply``,
-            ``calibration.npz`` and ``summary.json``, each replaced as a whole;
-            `uwsfm.open_result` reads it.
-        images: Folder that holds one folder of images per camera, to colour the points;
-            without it they keep the colours of the model, and what only the database
-            has is black.
-        database: COLMAP's database of the model: tracks are made again from all its
-            matches, and frames that the model lacks are registered; a model of poses
-            alone gets its points from it. It is not changed.
-        scene_distance_m: Of a single camera's scene, about: without a baseline it sets
-            the scale to start with; None: 1.
-        positions, lever_arm, lengths, report: As in `reconstruct`.
+            ``calibration.npz``, ``options.yaml`` and ``summary.json``, each replaced as
+            a whole; `uwsfm.open_result` reads it.
+        options: How; None: the defaults.
         progress: Called with each long step.
-        **options: Fields of `CalibrateOptions`.
+        **settings: Options by name, in place of those of ``options``; and fields of
+            `CalibrateOptions`.
 
     Raises:
         InputError: the model, the rig, an option or the output folder is not usable, or
             the rig contradicts the model; the message says what to change.
         UwsfmError: too little of the model agrees with the refractive one.
     """
-    asked = {**locals()}
-    command = command_line("refine", refine_model, asked)
+    options = (options or RefineOptions()).with_settings(settings)
+    command = command_line("refine", (source, rig), out, options)
+    asked = {"source": source, "rig": rig, "out": out, **options.values()}
     rig_source, rig = rig, checked_rig(rig)
-    settings = CalibrateOptions.parsed({**rig_options(rig), **options})
-    require_effect(settings)
-    distance_m = scene_distance(rig, scene_distance_m)
+    require_effect({**rig_options(rig), **options.adjustment.as_fields()})
     made_of = made_of_files(rig_source, source)
     require_elsewhere(out, source)
-    source, out = Path(source), output_folder(out, images, made_of)
-    found = _found(source)
-    if out.exists() and _same_or_inside(found.folder, out / SPARSE):
-        raise InputError(
-            f"{out / SPARSE} holds the model that is to be refined, which the result "
-            "would replace: choose another folder"
-        )
+    source, out = Path(source), output_folder(out, options.images, made_of)
     clock = time.perf_counter()
-    database = None if database is None else Path(database)
-    start = start_from_model(found, rig, distance_m, database)
-    images = None if images is None else Path(images)
-    if images is not None:
-        _check_images(images, rig, start)
-    matches, names = None, start.model.frame_names
-    if database is not None:
-        matches = read_image_database(database, start.model, rig)
-        names = matches.frame_names
-    known = KnownLengths.read(lengths, positions, lever_arm)
-    known.check_names(rig, names)
+    start, matches, lengths = _inputs(source, rig, out, options)
     timings = {"reading and checking the model": time.perf_counter() - clock}
     with locked(out), job_log(out, command, asked, progress) as log:
         job = _Job(
             rig=rig,
             start=start,
             database=matches,
-            lengths=known,
-            images=images,
+            lengths=lengths,
+            options=options,
             out=out,
             command=command,
             made_of=made_of,
-            report=report,
             progress=log.progress,
             timings=timings,
         )
-        result = job.run(options)
+        result = job.run()
         log.result(result.summary)
         return result
+
+
+def _inputs(
+    source: Path, rig: Rig, out: Path, options: RefineOptions
+) -> tuple[ModelStart, ImageDatabase | None, KnownLengths]:
+    """The model, its database and the known lengths, read and checked."""
+    known = options.constraints
+    distance_m = scene_distance(rig, known.scene_distance_m)
+    model = _found(source)
+    if out.exists() and _same_or_inside(model.folder, out / SPARSE):
+        raise InputError(
+            f"{out / SPARSE} holds the model that is to be refined, which the result "
+            "would replace: choose another folder"
+        )
+    start = start_from_model(model, rig, distance_m, options.database)
+    if options.images is not None:
+        _check_images(options.images, rig, start)
+    matches = None
+    if options.database is not None:
+        matches = read_image_database(options.database, start.model, rig)
+    lengths = KnownLengths.read(known.lengths, known.positions, known.lever_arm)
+    names = start.model.frame_names if matches is None else matches.frame_names
+    lengths.check_names(rig, names)
+    return start, matches, lengths
 
 
 def _found(source: Path) -> FoundModel:
@@ -229,26 +210,25 @@ class _Job:
     start: ModelStart
     database: ImageDatabase | None
     lengths: KnownLengths
-    images: Path | None
+    options: RefineOptions
     out: Path
     command: str | None
     made_of: dict[str, str | None]
-    report: bool
     progress: Progress
     timings: dict[str, float]
 
-    def run(self, options: dict[str, Any]) -> RefineResult:
+    def run(self) -> RefineResult:
         self.timings.update(compiled(thread_count(-1), self.progress))
         clock = time.perf_counter()
         tracks = self.start.tracks
-        refined = self._refined(tracks, None, options)
+        refined = self._refined(tracks, None)
         self._require_raw(refined)
         if self.database is not None:
             known, before = tracks.scene, refined.start_rms_px
             tracks = with_database(
                 self.database, refined, tracks.frame_names, self.progress
             )
-            refined = self._refined(tracks, known, options)
+            refined = self._refined(tracks, known)
             refined = replace(refined, start_rms_px=before)  # of the model, not of this
         self.timings["refractive adjustment"] = time.perf_counter() - clock
         clock = time.perf_counter()
@@ -262,6 +242,7 @@ class _Job:
         export_colmap(model, self.out / SPARSE)
         export_housing(model.rig, self.out / HOUSING, calibration, verdict=judged.word)
         export_given_rig(self.rig, self.out / RIG_GIVEN)
+        write_options(self.options, self.out / OPTIONS)
         export_points(model, self.out / POINTS, calibration)
         store_calibration(judged.solved, self.out)
         self.timings["colours and export"] = time.perf_counter() - clock
@@ -281,8 +262,9 @@ class _Job:
         )
         summary["explanations"] = [one.to_json() for one in causes]
         timing["looking for the cause"] = time.perf_counter() - clock
+        wanted = self.options.report
         write_with_report(
-            self.out, model, calibration, summary, self.progress, wanted=self.report
+            self.out, model, calibration, summary, self.progress, wanted=wanted
         )
         return RefineResult(
             model=model,
@@ -293,9 +275,7 @@ class _Job:
             verdict=judged.verdict,
         )
 
-    def _refined(
-        self, tracks: Tracks, known: Scene | None, options: dict[str, Any]
-    ) -> Refined:
+    def _refined(self, tracks: Tracks, known: Scene | None) -> Refined:
         scene, lengths = self.lengths.placed(self.rig, tracks.frame_names, tracks.scene)
         return refined_or_explained(
             scene,
@@ -304,7 +284,7 @@ class _Job:
             self.progress,
             known=known,
             lengths=lengths,
-            **options,
+            **self.options.adjustment.as_fields(),
         )
 
     def _require_raw(self, refined: Refined) -> None:
@@ -350,8 +330,8 @@ class _Job:
         self, scene: Scene, names: Sequence[str], model_idx: NDArray[np.int64]
     ) -> NDArray[np.uint8]:
         """RGB (P, 3) from the images, or else from the model."""
-        if self.images is not None:
-            paths = _image_paths(self.images, self.rig, names)
+        if self.options.images is not None:
+            paths = _image_paths(self.options.images, self.rig, names)
             return point_colors(scene, paths, self.progress)
         found = self.start.model
         colors = np.zeros((scene.num_points, 3), dtype=np.uint8)
@@ -386,8 +366,8 @@ class _Job:
             own = theirs["median_error_px"] = None
             notes.append(
                 f"{source} is a result of uwsfm, refractive already: its lenses lack "
-                f"the refraction that its {HOUSING} holds, and its own error as a "
-                "COLMAP model is not told, for it means nothing"
+                f"the refraction that its {HOUSING} holds, and its error as a COLMAP "
+                "model has no meaning"
             )
         error = model.errors_px()[both]
         return {
@@ -408,7 +388,7 @@ class _Job:
                 "refractive_error_of_common_px": _mean(error),
             },
             "warnings": notes,
-            "images": recorded_images(self.images),
+            "images": recorded_images(self.options.images),
             "timings_s": self.timings,
             "versions": versions(),
         }

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.choices import DEFAULT_ERRORS, PRIORS, ErrorName, Strategy
 from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.lengths import LengthFit, Lengths, PositionFit
 from uwsfm.errors import InputError
@@ -21,20 +22,6 @@ from uwsfm.solver.layout import HELD
 from uwsfm.solver.losses import LOSS_CODES
 
 PerCamera = bool | tuple[bool, ...]
-
-DEFAULT_ERRORS = {"joint": "reprojection", "nested": "virtual_camera"}
-"""Strategies, and what they minimise (nested: in its outer loop) unless told."""
-
-PRIORS = (
-    "distance_stddev_m",
-    "normal_stddev_deg",
-    "center_stddev_m",
-    "water_index_stddev",
-    "focal_stddev",
-    "principal_point_stddev_px",
-    "distortion_stddev",
-)
-
 
 LENS_PRIORS = PRIORS[4:]
 LENS_PARTS = {
@@ -62,12 +49,12 @@ class CalibrateOptions:
     """Of each of the two solves; 5-8 are usual."""
     initial_damping: float = 1e-4
     """1e-2 if the normals may be more than 30 degrees off."""
-    strategy: str = "joint"
+    strategy: Strategy = "joint"
     """"joint": everything moves together; "nested": the loops of the paper's fig. 5,
     some ten times slower, with the same end where the motion is rich. On a
     straight or level track their distances scatter more; with
     "virtual_camera_tangential" they are several standard deviations too long there."""
-    error: str | None = None
+    error: ErrorName | None = None
     """What is minimised: "reprojection" (pixels), "virtual_camera" or
     "virtual_camera_tangential" (metres on the port; the paper's eq. 6-10, centred on
     the axis or on the other sheet of the caustic), "point_3d" (metres in space). None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm.calibration.length_verdicts import ARBITRARY
+from uwsfm.export.schema import SCHEMA_VERSION
 from uwsfm.trust.verdict import DOES_NOT_FIT, FITS, Verdict
 
 CONFIDENT = ("determined", "weakly determined")
@@ -39,6 +40,7 @@ def with_verdict(verdict: Verdict, summary: Mapping[str, Any]) -> dict[str, Any]
         for camera in summary["cameras"]
     ]
     first = {
+        "schema_version": SCHEMA_VERSION,
         "verdict": word,
         "reasons": [
             {
