@@ -1,11 +1,16 @@
 """Finished steps are skipped, interrupted ones go on, changed ones start again."""
 
+import json
+from types import SimpleNamespace
+
 import pytest
 
 from uwsfm._partial import PARTIAL
 from uwsfm.errors import UwsfmError
+from uwsfm.sfm import steps as module
 from uwsfm.sfm.background import remove_database
-from uwsfm.sfm.steps import Steps
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.steps import Steps, fingerprint
 
 
 class Recorder:
@@ -131,3 +136,61 @@ def test_a_database_is_removed_with_its_journals(tmp_path):
         (tmp_path / name).write_text("x")
     remove_database(tmp_path / "a.db")
     assert [path.name for path in tmp_path.iterdir()] == ["b.db"]
+
+
+def test_seconds_are_those_between_start_and_end_to_a_thousandth(tmp_path, monkeypatch):
+    times = iter([1000.0, 1002.34567, 5000.0, 5000.0004])
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    steps = Recorder(tmp_path).run()
+    assert steps.seconds() == {"first": 2.346, "second": 0.0}
+    assert Steps(tmp_path).seconds() == {"first": 2.346, "second": 0.0}
+    record = json.loads((tmp_path / "steps.json").read_text())["steps"]
+    assert [row["finished"] for row in record.values()] == [True, True]
+    assert [row["fingerprint"] for row in record.values()] == [
+        fingerprint("a"),
+        fingerprint([fingerprint("a"), "b"]),
+    ]
+
+
+def test_a_step_that_lost_one_of_its_outputs_is_done_again(tmp_path):
+    names, done = ("one", "two", "three"), []
+
+    def run():
+        outputs = [tmp_path / "work" / name for name in names]
+
+        def act():
+            done.append("act")
+            for path in outputs:
+                path.write_text("x")
+
+        clear = done.append
+        Steps(tmp_path / "work").run(
+            "only", 1, act, outputs=outputs, clear=lambda: clear("clear")
+        )
+        assert all(path.exists() for path in outputs)
+
+    run()
+    for name in names:
+        run()
+        assert done == ["clear", "act"]  # the second time there is all of them
+        (tmp_path / "work" / name).unlink()
+        done.clear()
+        run()
+        assert done == ["clear", "act"]
+    for name in names:
+        (tmp_path / "work" / name).write_text("")
+        with pytest.raises(UwsfmError, match=f"{name} is damaged: remove the folder"):
+            run()
+        (tmp_path / "work" / name).write_text("x")
+
+
+def test_a_workspace_is_made_with_the_folders_above_it(tmp_path):
+    steps = Steps(tmp_path / "one" / "two")
+    assert steps.work_dir.is_dir() and steps.seconds() == {}
+
+
+def test_a_class_is_nothing_that_a_step_may_depend_on():
+    assert fingerprint(StartOptions()) == fingerprint([StartOptions()][0])
+    assert fingerprint(StartOptions()) != fingerprint(StartOptions(seed=5))
+    with pytest.raises(TypeError, match="^no step may depend on type$"):
+        fingerprint(StartOptions)

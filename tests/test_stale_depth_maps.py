@@ -123,7 +123,10 @@ def test_every_image_is_looked_for_before_the_first_is_matched(dense):
     maps = DepthMaps(dense, dense.images)
     maps.require_images()
     (dense.images / "right" / "0002.jpg").unlink()
-    with pytest.raises(InputError, match="0002.jpg"):
+    with pytest.raises(InputError, match="right.0002.jpg"):
+        maps.require_images()
+    (dense.images / "left" / "0002.jpg").unlink()
+    with pytest.raises(InputError, match="left.0002.jpg"):  # the first of the two
         maps.require_images()
 
 
