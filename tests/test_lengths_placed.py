@@ -378,6 +378,8 @@ def test_depths_are_checked_as_positions_are(tmp_path, rows, words):
         (0.0, -1.0, False),
         (1.01, 0.0, True),
         (0.0, -1.01, True),
+        (-12.3, 0.5, True),
+        (0.5, -12.3, True),
         (360.0, 51.5, True),
         (-360.0, 51.5, True),
         (360.01, 51.5, False),

@@ -121,6 +121,15 @@ def test_a_record_that_cannot_be_read_means_that_nothing_is_done(chain, content)
     assert chain.take() == ["clear first", "first", "second"]
 
 
+def test_a_record_that_does_not_say_that_it_ended_is_of_no_finished_step(chain):
+    path = chain.work_dir / "steps.json"
+    content = json.loads(path.read_text())
+    del content["steps"]["first"]["finished"]
+    path.write_text(json.dumps(content))
+    chain.run()
+    assert chain.take() == ["first", "second"]
+
+
 def test_half_written_outputs_of_a_killed_run_are_removed(chain):
     (chain.work_dir / f"{PARTIAL}x1.db").write_text("half")
     (chain.work_dir / f"{PARTIAL}x2").mkdir()
@@ -182,6 +191,19 @@ def test_a_step_that_lost_one_of_its_outputs_is_done_again(tmp_path):
         with pytest.raises(UwsfmError, match=f"{name} is damaged: remove the folder"):
             run()
         (tmp_path / "work" / name).write_text("x")
+
+
+def test_a_folder_that_a_step_made_may_have_no_size(tmp_path):
+    """As folders have on some file systems, whatever is in them."""
+    folder = SimpleNamespace(
+        exists=lambda: True,
+        is_file=lambda: False,
+        stat=lambda: SimpleNamespace(st_size=0),
+    )
+    done = []
+    for _ in range(2):
+        Steps(tmp_path).run("only", 1, lambda: done.append("act"), outputs=[folder])
+    assert done == ["act"]
 
 
 def test_a_workspace_is_made_with_the_folders_above_it(tmp_path):
