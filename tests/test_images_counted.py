@@ -1,6 +1,7 @@
 """Images are counted beside frames, which are there though one of theirs is not."""
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +39,14 @@ def test_images_that_see_a_point_are_counted():
     assert lost.any()
     fewer, _ = scene.select(np.logical_not(lost))
     assert _num_images(fewer) == 11
+
+
+def test_images_of_more_cameras_than_frames_are_counted_one_by_one():
+    cameras, frames = np.repeat(np.arange(4), 2), np.tile([0, 1], 4)
+    scene = SimpleNamespace(num_frames=2, camera_idx=cameras, frame_idx=frames)
+    assert _num_images(scene) == 8
+    scene.camera_idx, scene.frame_idx = cameras[1:], frames[1:]
+    assert _num_images(scene) == 7
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

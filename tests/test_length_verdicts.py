@@ -11,9 +11,10 @@ from hand_made_result import bars, positions, result_of, small_model
 from uwsfm.calibration.length_verdicts import (
     length_verdicts,
     scale_verdict,
+    small_length,
     small_unit,
 )
-from uwsfm.calibration.lengths import Distances, Lengths, Positions
+from uwsfm.calibration.lengths import Distances, Lengths, PositionFit, Positions
 from uwsfm.errors import InputError
 
 
@@ -51,6 +52,14 @@ def test_a_scale_is_determined_below_five_per_cent(stddev, word):
 def test_a_thousandth_of_an_arbitrary_length_is_no_millimetre():
     assert small_unit(None) == "1e-3, scale arbitrary"
     assert small_unit(0.45) == small_unit(0.01) == "mm"
+
+
+@pytest.mark.parametrize("known", [0.01, 0.3])
+def test_a_length_in_a_sentence_is_millimetres_or_of_no_unit(known):
+    assert small_length(0.01234, known) == "12.3 mm"
+    assert small_length(2.5, known) == "2500.0 mm"
+    assert small_length(0.01234, None) == "0.012 (scale arbitrary)"
+    assert small_length(2.56, None) == "2.6 (scale arbitrary)"
 
 
 def scaled(result, own, in_all, **more):
@@ -167,6 +176,41 @@ def test_a_turn_of_the_model_is_told_with_its_axis(result, degrees, word):
         assert (x, abs(y), abs(z)) == (0.0, 0.6, 0.8) and y * z > 0.0
 
 
+DEPTHS = np.array([False, False, True])
+
+
+def test_depths_say_nothing_of_the_heading_and_are_told_of_by_their_own_signs(result):
+    """A heading that is open is no news; the tilt is told with its axis."""
+    covariance = np.zeros((6, 6))
+    covariance[2, 2] = math.radians(50.0) ** 2
+    covariance[:2, :2] = math.radians(1.8) ** 2 * np.diag([1.0, 0.25])
+    fit = placed_fit(20, 0, covariance=covariance, measured=DEPTHS)
+    turn, axis = fit.turn
+    assert turn == pytest.approx(math.radians(1.8))
+    np.testing.assert_allclose(np.abs(axis), [1.0, 0.0, 0.0], atol=1e-12)
+    (level,) = sentences_of(result, fit)
+    assert level.startswith("depths level the model and give its height; its heading")
+    steep = replace(fit, covariance=1.21 / 0.81 * covariance)
+    _, turned = sentences_of(result, steep)
+    assert "is weakly determined (standard deviation 2 deg)" in turned
+    x, y, z = numbers(turned)[:3]
+    assert (abs(x), y, z) == (1.0, 0.0, 0.0)
+    # With all three of them it is the heading that is open.
+    _, axis = replace(fit, measured=np.ones(3, dtype=bool)).turn
+    np.testing.assert_allclose(np.abs(axis), [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_few_depths_are_mirrored_by_no_axes(result):
+    signs = "check the lever arm and its signs, the unit (metres) and the sign of the"
+    _, few = sentences_of(result, placed_fit(9, 1, measured=DEPTHS))
+    assert few == "1 of 9 positions contradict the images and were left out"
+    _, many = sentences_of(result, placed_fit(9, 4, measured=DEPTHS))
+    assert many.startswith("4 of 9 positions contradict the images and were left out: ")
+    assert signs in many and "axes" not in many
+    _, scattered = sentences_of(result, placed_fit(20, 0, scatter=2.2, measured=DEPTHS))
+    assert signs in scattered and "axes" not in scattered
+
+
 # ---- Arrays -------------------------------------------------------------------------
 
 
@@ -231,6 +275,35 @@ def test_positions_are_checked():
     ):
         with pytest.raises(InputError, match=words):
             Positions.from_arrays(frames, where, spread, arm)
+
+
+def test_what_is_not_said_of_positions_is_that_all_three_were_measured():
+    arrays = {
+        "frame_idx": np.arange(3),
+        "positions": np.zeros((3, 3)),
+        "covariances": np.tile(np.eye(3), (3, 1, 1)),
+        "lever_arm": np.zeros(3),
+    }
+    found = Positions(**arrays)
+    assert found.measured.tolist() == [True, True, True]
+    assert found.measured.dtype == bool and found.source == "positions"
+    made = Positions.from_arrays(np.arange(3), np.zeros((3, 3)), [1.0, 1.0, 1.0])
+    assert made.measured.tolist() == [True, True, True] and made.source == "positions"
+    depths = Positions.from_arrays(
+        np.arange(3), np.zeros((3, 3)), np.ones(3), measured=[0, 0, 1]
+    )
+    assert depths.measured.tolist() == [False, False, True]
+    assert depths.measured.dtype == bool
+    fit = PositionFit(
+        frame_idx=np.arange(3),
+        misses_m=np.zeros((3, 3)),
+        inliers=np.ones(3, dtype=bool),
+        scatter=1.0,
+        covariance=np.eye(6),
+    )
+    assert fit.measured.tolist() == [True, True, True]
+    assert replace(fit, measured=DEPTHS).in_frames(np.array([1])).measured is DEPTHS
+    assert Lengths().clicked.size == 0 and Lengths().clicked.dtype == np.int64
 
 
 def known():

@@ -320,3 +320,119 @@ def test_another_header_is_refused_with_the_right_one(tmp_path):
     assert (
         len(load_positions(nav(tmp_path, rows, " Frame ,X,y,z,sx,sy,SZ")).frames) == 3
     )
+
+
+DEPTHS = "frame,depth,sdepth"
+
+
+def test_depths_are_heights_below_the_surface(model, tmp_path):
+    """Positive downwards; the rest of the place is not known."""
+    rows = ["0001.jpg,12.5,0.1", "0000.jpg,-0.25,0.2", "0002.jpg,3,0.3"]
+    path = nav(tmp_path, rows, DEPTHS)
+    found = load_positions(path)
+    assert found.depths_only and found.source == str(path)
+    assert found.frames == ("0001.jpg", "0000.jpg", "0002.jpg")
+    assert found.positions.tolist() == [[0, 0, -12.5], [0, 0, 0.25], [0, 0, -3.0]]
+    assert found.stddevs.tolist() == [[1e3, 1e3, s] for s in (0.1, 0.2, 0.3)]
+    given = KnownLengths.read(None, path, [0.1, 0.2, 0.3])
+    _, lengths = given.placed(model.rig, model.frame_names, model.scene)
+    known = lengths.positions
+    assert known.measured.tolist() == [False, False, True]
+    assert known.frame_idx.tolist() == [1, 0, 2]
+    assert known.positions[:, 2].tolist() == [-12.5, 0.25, -3.0]
+    deviations = [np.sqrt(np.diag(block)).tolist() for block in known.covariances]
+    np.testing.assert_allclose(deviations, found.stddevs)
+    whole = load_positions(nav(tmp_path, [f"{k},{k},2,3,1,1,1" for k in range(3)]))
+    assert not whole.depths_only
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (["a,5,1", "b,5.009,1", "c,5.018,1"], "lie within 20 mm of each other"),
+        (["a,5,1", "b,5.011,1", "c,5.022,1"], None),
+        (["a,9,1", "b,10,1", "c,11000,1"], "coordinates up to 11000 m are not of a"),
+        (["a,9,1", "b,10,1", "c,9900,1"], None),
+        (["a,9,1", "b,10,0", "c,11,1"], "row 3: sdepth: 0 m must be positive"),
+        (["a,9,1", "b,10,1000001", "c,11,1"], "row 3: sdepth: 1e"),
+        (["a,9,1", "b,10,1000000", "c,11,1"], None),
+        (["a,9,1", "b,10,1,1", "c,11,1"], "row 3: 4 columns instead of 3"),
+        (["a,9,1", "b,x,1", "c,11,1"], "row 3: depth: 'x' is not a number"),
+        (["a,9,1", "b,inf,1", "c,11,1"], "row 3: depth: inf is not finite"),
+        (["a,9,1", "b,10,1"], "2 positions are too few"),
+    ],
+)
+def test_depths_are_checked_as_positions_are(tmp_path, rows, words):
+    path = nav(tmp_path, rows, DEPTHS)
+    if words is None:
+        assert load_positions(path).depths_only
+    else:
+        with pytest.raises(InputError, match=words):
+            load_positions(path)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "degrees"),
+    [
+        (1.0, 0.0, False),  # a dive straight down, a metre from the origin
+        (0.0, -1.0, False),
+        (1.01, 0.0, True),
+        (0.0, -1.01, True),
+        (-12.3, 0.5, True),
+        (0.5, -12.3, True),
+        (360.0, 51.5, True),
+        (-360.0, 51.5, True),
+        (360.01, 51.5, False),
+        (51.5, 360.01, False),
+    ],
+)
+def test_degrees_are_more_than_one_and_up_to_a_full_turn(tmp_path, x, y, degrees):
+    path = nav(tmp_path, [f"{k},{x},{y},{5 * k},1,1,1" for k in range(3)])
+    if degrees:
+        words = f"if {x:.4f} and {y:.4f} are degrees of longitude and latitude"
+        with pytest.raises(InputError, match=words):
+            load_positions(path)
+    else:
+        assert len(load_positions(path).frames) == 3
+
+
+@pytest.mark.parametrize("changes", ["x", "y"])
+def test_positions_that_move_along_one_axis_are_metres(tmp_path, changes):
+    rows = [
+        f"{k},{12 + 0.021 * k if changes == 'x' else 12},"
+        f"{51 + 0.021 * k if changes == 'y' else 51},3,1,1,1"
+        for k in range(3)
+    ]
+    assert load_positions(nav(tmp_path, rows)).positions[2, 2] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"ends": BARS[0]["ends"] + BARS[1]["ends"][:1]}, "ends: needs 2 values, got"),
+        ({"ends": BARS[0]["ends"][:1]}, "ends: needs 2 values, got 1"),
+        ({"ends": [BARS[0]["ends"][0][:1], BARS[0]["ends"][1]]}, r"ends\[0\]"),
+        ({"length_m": 1.1e6}, "length_m"),
+        ({"length_m": 0.0}, "length_m"),
+        ({"stddev_m": 0.0}, "stddev_m"),
+        ({"click_stddev_px": 0.0}, "click_stddev_px"),
+        ({"length_m": 0.9e6}, None),
+    ],
+)
+def test_a_bar_has_two_ends_of_two_clicks_and_a_length(tmp_path, change, words):
+    path = lengths_file(tmp_path, scale_bars=[BARS[1], {**BARS[0], **change}])
+    if words is None:
+        assert load_lengths(path).scale_bars[1].length_m == 9e5
+    else:
+        with pytest.raises(InputError, match=rf"scale_bars\[1\]\.{words}"):
+            load_lengths(path)
+
+
+@pytest.mark.parametrize("frames", [["a"], ["a", "b", "c"], []])
+def test_a_distance_is_between_two_frames(tmp_path, frames):
+    pair = {"frames": frames, "length_m": 1.0, "stddev_m": 0.1}
+    words = rf"frame_distances\[0\].frames: needs 2 values, got {len(frames)}"
+    with pytest.raises(InputError, match=words):
+        load_lengths(lengths_file(tmp_path, frame_distances=[pair]))
+    with pytest.raises(InputError, match="neither scale_bars nor frame_distances are"):
+        load_lengths(lengths_file(tmp_path))

@@ -9,14 +9,20 @@ from hand_made import numbers
 from measured import clicked, one, small_result
 
 from uwsfm.calibration.propagation import Propagation
-from uwsfm.cloud import Cloud, write_cloud
+from uwsfm.cloud import Cloud, read_cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.lengths_file import Click
 from uwsfm.measuring.measurements_file import Task
 from uwsfm.measuring.picks import PixelPick, PointPick
 from uwsfm.measuring.spots import Spotter
-from uwsfm.measuring.surface import CANDIDATES, Surface, SurfaceImage, views_of
+from uwsfm.measuring.surface import (
+    CANDIDATES,
+    Surface,
+    SurfaceImage,
+    surface_of,
+    views_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -115,11 +121,12 @@ def plane_cloud(folder, stddev, result):
     return replace(result, folder=folder), level
 
 
-def ray_on(result, frame, xy, level):
-    """Where the ray of a pixel of the left camera meets the floor; its direction."""
+def ray_on(result, frame, xy, level, camera=0):
+    """Where the ray of a pixel of a camera meets the floor; its direction."""
     scene = result.model.scene
-    origin, direction = scene.cameras[0].ray_from_img([xy])
-    back = rigid3.inverse(scene.rig_from_world[frame])
+    origin, direction = scene.cameras[camera].ray_from_img([xy])
+    pose = rigid3.compose(scene.cam_from_rig[camera], scene.rig_from_world[frame])
+    back = rigid3.inverse(pose)
     start = rigid3.transform(back, origin)[0]
     along = rigid3.rotate(back, direction)[0]
     return start + (level - start[2]) / along[2] * along, along
@@ -147,6 +154,41 @@ def test_a_pixel_slides_on_the_floor_as_its_click_errs(result, tmp_path):
     reach = numbers(found.spots[0].how)[-1]
     spacing = 0.01 / np.linalg.norm(steps[0])
     assert 1.2 * spacing < reach < 3.5 * spacing  # twelve of a grid of so many pixels
+
+
+def test_a_pixel_is_looked_up_in_its_own_image(result, tmp_path):
+    """Frames and cameras of different numbers, one image after another and back."""
+    dense, level = plane_cloud(tmp_path, 1e-6, result)
+    clicks = [(1, 0, (400, 300)), (0, 2, (390, 310)), (1, 2, (380, 290))]
+    clicks += [(0, 2, (430, 330)), (0, 0, (410, 300))]
+    picks = [
+        f"{('left', 'right')[camera]}/{frame:04}.jpg:{x},{y}"
+        for camera, frame, (x, y) in clicks
+    ]
+    found = one(dense, click_stddev_px=20.0, polylines=[{"through": picks}])
+    calm = one(dense, click_stddev_px=0.01, polylines=[{"through": picks}])
+    added = np.sqrt(found.places_stddev**2 - calm.places_stddev**2)
+    for place, noise, (camera, frame, xy) in zip(
+        found.points, added, clicks, strict=True
+    ):
+        expected, _ = ray_on(result, frame, xy, level, camera)
+        np.testing.assert_allclose(place, expected, atol=1e-6)
+        # And it slides as the next pixels of that image lie on the floor.
+        steps = [
+            ray_on(result, frame, np.add(xy, 0.5 * s), level, camera)[0]
+            - ray_on(result, frame, np.add(xy, -0.5 * s), level, camera)[0]
+            for s in np.eye(2)
+        ]
+        assert noise == pytest.approx(20.0 * np.linalg.norm(steps), rel=0.005)
+
+
+def test_the_image_of_the_last_click_is_kept_for_the_next(result):
+    spotter = Spotter(result, Propagation(result.calibration))
+    first = spotter._image(0, 1)
+    assert spotter._image(0, 1) is first
+    other = spotter._image(1, 0)
+    assert other is not first and other.lens is result.model.scene.cameras[1]
+    assert spotter._image(1, 0) is other and first.lens is not other.lens
 
 
 def test_a_place_of_a_cloud_is_no_better_than_the_cloud_states(result, tmp_path):
@@ -227,6 +269,129 @@ def test_a_patch_has_the_roughness_of_its_points(result):
     assert np.linalg.norm(patch.normal) == pytest.approx(1.0)
 
 
+def test_the_spacing_of_a_cloud_is_that_of_most_of_its_points():
+    """Eleven points 10 mm from each other, and one a metre away."""
+    row = np.column_stack([0.01 * np.arange(11.0), np.zeros(11), np.ones(11)])
+    surface = Surface(np.vstack([row, [1.1, 0.0, 1.0]]), "a cloud", np.ones(12))
+    assert surface.nearest(np.array([0.0, 0.045, 1.0]))[0] == 0
+    with pytest.raises(InputError, match="is 0.055 m away, the points there 0.01 m"):
+        surface.nearest(np.array([0.0, 0.055, 1.0]))
+
+
+def on_pixels(result, xy, ranges):
+    """What the first left camera sees at pixels, so far along their rays (in it)."""
+    origins, directions = result.model.scene.cameras[0].ray_from_img(xy)
+    return origins + np.asarray(ranges)[:, None] * directions
+
+
+MIDDLE = np.array([400.0, 300.0])
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.54, False), (0.66, True)])
+def test_points_are_around_a_pixel_up_to_three_fifths_of_their_reach(
+    result, share, refused
+):
+    """Twelve on a circle of 10 px, whose middle is so much of that aside."""
+    right = share + np.linspace(-0.3, 0.3, 6)
+    up = np.sqrt(1.0 - right**2)
+    ring = np.vstack([np.column_stack([right, up]), np.column_stack([right, -up])])
+    for turned in (ring, ring[:, ::-1], -ring):
+        xy = MIDDLE + 10.0 * turned
+        image = seen(result, on_pixels(result, xy, np.ones(12)))
+        if refused:
+            with pytest.raises(InputError, match="the depth jumps there, from"):
+                image.patch(tuple(MIDDLE))
+        else:
+            # The projection back is iterated to a billionth of a pixel.
+            found = image.patch(tuple(MIDDLE)).reach_px
+            assert found == pytest.approx(10.0, abs=1e-5)
+
+
+def test_a_jump_in_depth_is_told_from_its_nearest_to_its_farthest(result):
+    """Eighteen points left of the pixel, half a metre nearer than those right of it."""
+    x, y = (c.ravel() for c in np.meshgrid([3, 4, 5, 6, 7, 8], [-1, 0, 1]))
+    xy = MIDDLE + np.vstack([np.column_stack([-x, y]), np.column_stack([x, y])])
+    ranges = np.repeat([1.0, 1.5], 18)
+    image = seen(result, on_pixels(result, xy, ranges))
+    # From the lens: a few centimetres more than from the port.
+    first, last = sorted({f"{r:.3g}" for r in (image.ranges.min(), image.ranges.max())})
+    assert 1.0 <= float(first) < 1.1 and 1.5 <= float(last) < 1.6
+    words = f"jumps there, from {first} to {last} m around the pixel: click the spot"
+    with pytest.raises(InputError, match=words):
+        image.patch(tuple(MIDDLE))
+    # With eleven points only, though all around; with twelve there is a surface.
+    for count in (11, 12):
+        turn = np.arange(count) * 2.0 * np.pi / count
+        ring = MIDDLE + 9.0 * np.column_stack([np.cos(turn), np.sin(turn)])
+        far = MIDDLE + 12.0 * np.column_stack([np.cos(turn), np.sin(turn)])
+        both = on_pixels(
+            result, np.vstack([ring, far]), np.repeat([1.0, 1.5], [count, count])
+        )
+        image = seen(result, both)
+        if count == 11:
+            with pytest.raises(InputError, match="the depth jumps there"):
+                image.patch(tuple(MIDDLE))
+        else:
+            near = np.linalg.norm(both[image.rows[image._front(tuple(MIDDLE))]], axis=1)
+            assert len(near) == 12 and near.max() < 1.2
+
+
+@pytest.mark.parametrize(("off", "refused"), [(0.045, False), (0.055, True)])
+def test_a_surface_is_edge_on_where_it_is_rough_by_a_twentieth(result, off, refused):
+    """Twelve points above and below a plane that is seen at a sine of 0.1, so that they
+    are ten times as far from it along the ray."""
+    (origin,), (sight,) = result.model.scene.cameras[0].ray_from_img([MIDDLE])
+    across = np.cross(sight, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    up, cosine = np.cross(sight, across), math.sqrt(0.99)
+    normal = cosine * across + 0.1 * sight
+    along = -0.1 * across + cosine * sight
+    corners = [
+        a * along + b * up + c * normal
+        for a in (-0.02, 0.0, 0.02)
+        for b in (-0.01, 0.01)
+        for c in (-0.1 * off, 0.1 * off)
+    ]
+    # Behind the camera are some more, which have no pixel.
+    points = np.vstack([np.outer([1.0, 2.0, 3.0], -sight), origin + sight + corners])
+    scene = result.model.scene
+    world = rigid3.transform(rigid3.inverse(scene.rig_from_world[0]), points)
+    stated = np.array([9.0, 9.0, 9.0, *(0.001 * np.arange(1, 12)), 5.0])
+    image = SurfaceImage(Surface(world, "a cloud", stated), scene, 0, 0)
+    if refused:
+        with pytest.raises(InputError, match="the surface is seen edge-on there: clic"):
+            image.patch(tuple(MIDDLE))
+        return
+    patch = image.patch(tuple(MIDDLE))
+    assert patch.relief == pytest.approx(off, rel=1e-6)
+    assert patch.stddev == pytest.approx(0.0065)  # between the sixth and the seventh
+    back = rigid3.inverse(scene.rig_from_world[0])
+    middle = rigid3.transform(back, (origin + sight)[None])[0]
+    np.testing.assert_allclose(patch.point, middle, atol=1e-7)
+    turned = rigid3.rotate(back, np.stack([sight, normal]))
+    np.testing.assert_allclose(patch.sight, turned[0], atol=1e-12)
+    assert abs(patch.normal @ turned[1]) == pytest.approx(1.0, abs=1e-9)
+    bare = SurfaceImage(Surface(world, "the sparse model"), scene, 0, 0)
+    assert math.isnan(bare.patch(tuple(MIDDLE)).stddev)
+
+
+def test_a_dense_cloud_takes_twelve_points(result, tmp_path):
+    dense, _ = plane_cloud(tmp_path, 0.002, result)
+    whole = surface_of(dense)
+    assert whole.name == "dense/cloud.ply" and not whole.is_model
+    assert whole.stddev == pytest.approx(np.full(len(whole.points), 0.002))
+    assert surface_of(result).is_model
+    path = tmp_path / "dense" / "cloud.ply"
+    cloud = read_cloud(path)
+    for count in (11, 12):
+        write_cloud(cloud.select(np.arange(len(cloud)) < count), path)
+        if count == 11:
+            with pytest.raises(InputError, match="cloud.ply has 11 points only"):
+                surface_of(dense)
+        else:
+            assert len(surface_of(dense).points) == 12
+
+
 def test_a_pixel_needs_twelve_points_around_it(result):
     lens = result.model.scene.cameras[0]
     (xy,), _ = lens.img_from_point([[0.0, 0.0, 1.0]])
@@ -258,6 +423,28 @@ def test_a_place_is_seen_by_the_images_that_saw_the_points_around(result):
     # Left of the images nothing sees it, whoever saw its neighbours.
     aside = scene.points[4] + [30.0, 0.0, 0.0]
     assert len(views_of(scene, model, aside)[0]) == 0
+
+
+@pytest.mark.parametrize(("count", "sees"), [(9, True), (10, False)])
+def test_ten_points_around_tell_who_sees_a_place(result, count, sees):
+    """An image that lost so many of them, and has all others."""
+    scene = result.model.scene
+    model = Surface(scene.points, "the sparse model")
+    place = scene.points[4] + [0.001, 0.0, 0.0]
+    near = np.argsort(np.linalg.norm(scene.points - place, axis=1))[:count]
+    tenth = np.argsort(np.linalg.norm(scene.points - place, axis=1))[9]
+    at = int(np.flatnonzero(scene.point_idx == tenth)[0])
+    camera, frame = int(scene.camera_idx[at]), int(scene.frame_idx[at])
+    mine = (scene.camera_idx == camera) & (scene.frame_idx == frame)
+    kept = ~(mine & np.isin(scene.point_idx, near))
+    assert np.any(mine & kept)
+    columns = ("camera_idx", "frame_idx", "point_idx", "xy")
+    rest = replace(scene, **{name: getattr(scene, name)[kept] for name in columns})
+    cameras, frames, _ = views_of(rest, model, place)
+    found = list(zip(cameras.tolist(), frames.tolist(), strict=True))
+    assert ((camera, frame) in found) == sees and len(found) > 2
+    whole = views_of(scene, model, place)
+    assert (camera, frame) in list(zip(*(c.tolist() for c in whole[:2]), strict=True))
 
 
 def test_a_bar_is_entered_if_its_clicks_are_those_of_the_adjustment(result):

@@ -164,6 +164,19 @@ def test_remarks_have_their_units():
     assert table_of(item("height", flatness=flat))[0][4] == ""
 
 
+def test_columns_have_their_heads():
+    result = MeasureResult(
+        unit="metre", measurements=(item(),), scale_bars=None, warnings=(), summary={}
+    )
+    heads = ["", "kind", "value ± in all", "± images", ""]
+    table = measurement_table(result)
+    assert printed(table)[0] == heads and table.title == "measured"
+    arbitrary = measurement_table(replace(result, unit="scale arbitrary"))
+    assert arbitrary.title == "measured (scale arbitrary)"
+    aligned = [column.justify for column in table.columns]
+    assert aligned == ["left", "left", "right", "right", "left"]
+
+
 # ---- JSON ---------------------------------------------------------------------------
 
 

@@ -367,6 +367,18 @@ def test_a_verdict_is_printed_with_its_reasons_and_causes(causes):
     assert [line.rstrip() for line in lines] == [f"  {text}" for text in wanted]
 
 
+@pytest.mark.parametrize(("spare", "lines"), [(0, 1), (-1, 2)])
+def test_reasons_and_causes_take_the_whole_width(spare, lines):
+    """Beside two columns on their left."""
+    text = (console.width - len("  doubtful: ") - spare) * "x"
+    cause = (console.width - len("  cause: ") - spare) * "y"
+    data = summary(verdict="doubtful", explanations=[{"text": cause}])
+    data["reasons"] = [{"severity": "doubtful", "text": text}]
+    with console.capture() as captured:
+        print_verdict(data)
+    assert captured.get().count("\n") == 1 + 2 * lines
+
+
 def test_a_result_that_fits_has_no_cause_to_be_told():
     with console.capture() as captured:
         print_verdict(summary(verdict="fits", reasons=[], explanations=[]))

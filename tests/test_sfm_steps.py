@@ -1,11 +1,16 @@
 """Finished steps are skipped, interrupted ones go on, changed ones start again."""
 
+import json
+from types import SimpleNamespace
+
 import pytest
 
 from uwsfm._partial import PARTIAL
 from uwsfm.errors import UwsfmError
+from uwsfm.sfm import steps as module
 from uwsfm.sfm.background import remove_database
-from uwsfm.sfm.steps import Steps
+from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.steps import Steps, fingerprint
 
 
 class Recorder:
@@ -116,6 +121,15 @@ def test_a_record_that_cannot_be_read_means_that_nothing_is_done(chain, content)
     assert chain.take() == ["clear first", "first", "second"]
 
 
+def test_a_record_that_does_not_say_that_it_ended_is_of_no_finished_step(chain):
+    path = chain.work_dir / "steps.json"
+    content = json.loads(path.read_text())
+    del content["steps"]["first"]["finished"]
+    path.write_text(json.dumps(content))
+    chain.run()
+    assert chain.take() == ["first", "second"]
+
+
 def test_half_written_outputs_of_a_killed_run_are_removed(chain):
     (chain.work_dir / f"{PARTIAL}x1.db").write_text("half")
     (chain.work_dir / f"{PARTIAL}x2").mkdir()
@@ -131,3 +145,74 @@ def test_a_database_is_removed_with_its_journals(tmp_path):
         (tmp_path / name).write_text("x")
     remove_database(tmp_path / "a.db")
     assert [path.name for path in tmp_path.iterdir()] == ["b.db"]
+
+
+def test_seconds_are_those_between_start_and_end_to_a_thousandth(tmp_path, monkeypatch):
+    times = iter([1000.0, 1002.34567, 5000.0, 5000.0004])
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    steps = Recorder(tmp_path).run()
+    assert steps.seconds() == {"first": 2.346, "second": 0.0}
+    assert Steps(tmp_path).seconds() == {"first": 2.346, "second": 0.0}
+    record = json.loads((tmp_path / "steps.json").read_text())["steps"]
+    assert [row["finished"] for row in record.values()] == [True, True]
+    assert [row["fingerprint"] for row in record.values()] == [
+        fingerprint("a"),
+        fingerprint([fingerprint("a"), "b"]),
+    ]
+
+
+def test_a_step_that_lost_one_of_its_outputs_is_done_again(tmp_path):
+    names, done = ("one", "two", "three"), []
+
+    def run():
+        outputs = [tmp_path / "work" / name for name in names]
+
+        def act():
+            done.append("act")
+            for path in outputs:
+                path.write_text("x")
+
+        clear = done.append
+        Steps(tmp_path / "work").run(
+            "only", 1, act, outputs=outputs, clear=lambda: clear("clear")
+        )
+        assert all(path.exists() for path in outputs)
+
+    run()
+    for name in names:
+        run()
+        assert done == ["clear", "act"]  # the second time there is all of them
+        (tmp_path / "work" / name).unlink()
+        done.clear()
+        run()
+        assert done == ["clear", "act"]
+    for name in names:
+        (tmp_path / "work" / name).write_text("")
+        with pytest.raises(UwsfmError, match=f"{name} is damaged: remove the folder"):
+            run()
+        (tmp_path / "work" / name).write_text("x")
+
+
+def test_a_folder_that_a_step_made_may_have_no_size(tmp_path):
+    """As folders have on some file systems, whatever is in them."""
+    folder = SimpleNamespace(
+        exists=lambda: True,
+        is_file=lambda: False,
+        stat=lambda: SimpleNamespace(st_size=0),
+    )
+    done = []
+    for _ in range(2):
+        Steps(tmp_path).run("only", 1, lambda: done.append("act"), outputs=[folder])
+    assert done == ["act"]
+
+
+def test_a_workspace_is_made_with_the_folders_above_it(tmp_path):
+    steps = Steps(tmp_path / "one" / "two")
+    assert steps.work_dir.is_dir() and steps.seconds() == {}
+
+
+def test_a_class_is_nothing_that_a_step_may_depend_on():
+    assert fingerprint(StartOptions()) == fingerprint([StartOptions()][0])
+    assert fingerprint(StartOptions()) != fingerprint(StartOptions(seed=5))
+    with pytest.raises(TypeError, match="^no step may depend on type$"):
+        fingerprint(StartOptions)

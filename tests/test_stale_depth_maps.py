@@ -9,6 +9,7 @@ from hand_made_result import result_of, small_model
 
 from uwsfm.dense.depth_map import DepthMap, write_depth_map
 from uwsfm.dense.maps import DepthMaps
+from uwsfm.dense.stereo_maps import StereoMaps
 from uwsfm.errors import InputError
 from uwsfm.result_folder import Result
 
@@ -102,6 +103,24 @@ def test_a_depth_map_is_of_its_range(dense):
     assert changed(before, with_scene(dense, rig_from_world=poses)) == [0, 2]
 
 
+def test_a_depth_map_is_of_either_end_of_its_range_and_of_its_size(dense):
+    maps = DepthMaps(dense, dense.images)
+    before = depth_keys(dense)
+    for name in ("near", "far"):
+        views = list(maps.views)
+        views[1] = replace(views[1], **{name: getattr(views[1], name) + 1e-12})
+        other = StereoMaps(dense.model, dense.images, views, 1e9)
+        whole = StereoMaps(dense.model, dense.images, maps.views, 1e9)
+        assert [other.key(k) == whole.key(k) for k in range(3)] == [True, False, True]
+    # An image of 800 x 600 as one of 400 x 300.
+    small = StereoMaps(dense.model, dense.images, maps.views, 1.3e5)
+    assert whole.factor(0) == whole.factor(1) == 1 and small.factor(0) == 2
+    assert all(small.key(k) != whole.key(k) for k in range(3))
+    assert before == [whole.key(k) for k in range(3)]
+    names = [small.name(view) for view in maps.views]
+    assert names == ["000000_0-1.npz", "000001_0-1.npz", "000002_0-1.npz"]
+
+
 def test_a_depth_map_that_is_old_or_missing_is_told(dense):
     maps = DepthMaps(dense, dense.images)
     path = dense.folder / "uwsfm-work" / "dense" / "000001_0-1.npz"
@@ -123,7 +142,10 @@ def test_every_image_is_looked_for_before_the_first_is_matched(dense):
     maps = DepthMaps(dense, dense.images)
     maps.require_images()
     (dense.images / "right" / "0002.jpg").unlink()
-    with pytest.raises(InputError, match="0002.jpg"):
+    with pytest.raises(InputError, match="right.0002.jpg"):
+        maps.require_images()
+    (dense.images / "left" / "0002.jpg").unlink()
+    with pytest.raises(InputError, match="left.0002.jpg"):  # the first of the two
         maps.require_images()
 
 

@@ -1,10 +1,12 @@
 """Touch one input of a run: exactly the steps that depend on it are done again."""
 
+import inspect
 import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -14,6 +16,7 @@ from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.export.calibration_file import fingerprint as model_fingerprint
 from uwsfm.models.port import FlatPort
+from uwsfm.sfm import refractive_steps, start
 from uwsfm.sfm.images import find_frames
 from uwsfm.sfm.options import (
     FeatureOptions,
@@ -349,6 +352,127 @@ def test_a_step_has_its_outputs_and_leaves_nothing_of_other_inputs(images):
             with pycolmap.Database.open(str(space.features)) as database:
                 assert not database.exists_matches(*pair)
     assert not space.features.exists()
+
+
+class Doing(Keys):
+    """Takes some steps of earlier runs for done, and does the others."""
+
+    def run(self, name, inputs, action, *, outputs, clear=None):
+        if name in ("features", "matches"):
+            return "done"
+        return Steps.run(self, name, inputs, action, outputs=outputs, clear=clear)
+
+
+def noted(monkeypatch, module, name, gives, makes=None):
+    """Put in the place of a function what notes its arguments by their names."""
+    found: dict = {}
+    takes = inspect.signature(getattr(module, name))
+
+    def instead(*args, **keywords):
+        found.update(takes.bind(*args, **keywords).arguments)
+        if makes is not None:
+            makes.mkdir(exist_ok=True)
+        return gives
+
+    monkeypatch.setattr(module, name, instead)
+    return found
+
+
+@pytest.mark.parametrize("mapper", ["pinhole", "refractive"])
+def test_every_step_is_given_what_it_works_on(images, monkeypatch, mapper):
+    """And the summary of the start says what it took, and what was odd."""
+    masks = images.parent / "masks"
+    options = StartOptions(
+        mapper=mapper, scene_distance_m=3.5, features=FeatureOptions(mask_dir=masks)
+    )
+    rig, work = replace(RIG, cam_from_rig=None), images.parent / "work"
+    frames, space = find_frames(images, rig), Workspace(work_dir=work)
+    steps = Doing(work)
+    assert match_key(rig, frames, steps, space, options) == "done"
+    placement = np.array([[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, -0.25, 0, 0]])
+    fixed = SimpleNamespace(
+        pinholes=["pinhole"], rotation=SimpleNamespace(cam_from_rig="turned")
+    )
+    ended = SimpleNamespace(summary={"warnings": ["of the mapper"], "num_points": 9})
+    baseline = noted(monkeypatch, start, "rig_from_baseline", placement)
+    fitted = noted(monkeypatch, start, "fix_rig", fixed)
+    database = noted(
+        monkeypatch, start, "write_mapping_database", None, makes=space.mapping
+    )
+    if mapper == "pinhole":
+        done = noted(monkeypatch, start, "_map", None, makes=space.perspective)
+        read = noted(monkeypatch, start, "load_start", ended)
+    else:
+        best = SimpleNamespace(
+            cam_from_rig="best",
+            registered=np.array([True, False, True]),
+            num_registered=2,
+            counts=lambda: {"num_points": 9},
+        )
+        other = SimpleNamespace(num_registered=1)
+        steps_of_it = refractive_steps
+        pairs = noted(monkeypatch, steps_of_it, "read_correspondences", "matches")
+        done = noted(monkeypatch, steps_of_it, "map_incrementally", [best, other])
+        turned = noted(monkeypatch, steps_of_it, "turned_to", "ended")
+        told = noted(monkeypatch, steps_of_it, "mapping_summary", {"told": 1})
+        written = noted(
+            monkeypatch,
+            steps_of_it,
+            "write_refractive_start",
+            None,
+            makes=space.refractive,
+        )
+        read = noted(monkeypatch, steps_of_it, "load_refractive_start", ended)
+    monkeypatch.setattr(start, "range_warnings", lambda of: [f"{len(of.names)} dark"])
+
+    found = start_from_matches(rig, frames, steps, "done", options, print)
+
+    assert found is ended and found.summary["num_points"] == 9
+    of_mapper, of_masks, of_range = found.summary["warnings"]
+    assert of_mapper == "of the mapper" and of_range == "3 dark"
+    assert of_masks.startswith("4 of 6 images have no mask in")
+    assert list(found.summary["timings_s"]) == ["rig", "verification", "mapping"]
+    assert found.summary["steps_of_earlier_runs"] == []
+    for given in (baseline, fitted, database, done):
+        for name, value in {
+            "rig": rig,
+            "frames": frames,
+            "options": options,
+            "progress": print,
+            "features_path": space.features,
+            "space": space,
+            "fixed": fixed,
+            "mapping_path": space.mapping,
+            "scene_distance_m": 3.5,
+            "work_dir": work,
+        }.items():
+            assert name not in given or given[name] == value, name
+    assert np.array_equal(fitted["poses"], placement)
+    assert database["pinholes"] == ["pinhole"] and database["cam_from_rig"] == "turned"
+    assert len(database["cameras"]) == 2
+    assert read["features_path"] == space.features and read["frames"] is frames
+    if mapper == "pinhole":
+        assert read["model_path"] == space.perspective
+        return
+    assert read["path"] == written["path"] == space.refractive
+    assert list(pairs.values()) == [space.features, space.mapping, frames, rig]
+    assert list(done.values()) == ["matches", rig, "turned", options, print]
+    assert list(turned.values()) == [fixed, "best"]
+    assert list(told.values()) == [rig, frames, "ended", {NAMES[0], NAMES[2]}, [1]]
+    assert list(written.values())[1:] == [best, {"num_points": 9, "told": 1}]
+
+    # Nothing is done again; what took how long is still told.
+    for given in (baseline, database, done):
+        given.clear()
+    ended.summary = {"warnings": []}
+    again = start_from_matches(rig, frames, Doing(work), "done", options, print)
+    assert not baseline and not database and not done
+    assert again.summary["steps_of_earlier_runs"] == ["rig", "verification", "mapping"]
+
+
+def match_key(rig, frames, steps, space, options):
+    pycolmap.Database.open(str(space.features)).close()
+    return match_images(rig, frames, steps, space, options, print)
 
 
 def two_images(database):

@@ -1,14 +1,17 @@
 """Files for other programs: what one number of a point or a pixel is, read back."""
 
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hand_made_result import small_model
 
-from uwsfm.errors import InputError
+from uwsfm._checksums import write_checksums
+from uwsfm.errors import InputError, MissingPackageError
 from uwsfm.export.files import (
+    HOUSING,
     SUMMARY,
     WORK,
     depth_stddev,
@@ -122,6 +125,38 @@ def test_a_model_is_read_back_with_its_housing(model, tmp_path):
         np.testing.assert_allclose(after.port.row, before.port.row, rtol=1e-12)
 
 
+def test_every_file_of_a_model_is_held_against_its_checksum(model, tmp_path):
+    """A byte more, which their readers would not mind; and what was not copied."""
+    export_colmap(model, tmp_path / "sparse")
+    export_housing(model.rig, tmp_path / "housing.yaml")
+    paths = [*sorted((tmp_path / "sparse").iterdir()), tmp_path / "housing.yaml"]
+    names = ["cameras", "frames", "images", "points3D", "rigs"]
+    assert [path.name for path in paths] == [*(f"{n}.bin" for n in names), HOUSING]
+    write_checksums(tmp_path, paths)
+    assert read_model(tmp_path).scene.num_points == model.scene.num_points
+    for path in paths:
+        content = path.read_bytes()
+        path.write_bytes(content + b"\n")
+        changed = f"{path.name} is not the file that the run wrote"
+        with pytest.raises(InputError, match=changed):
+            read_model(tmp_path)
+        path.unlink()
+        with pytest.raises(InputError, match=f"{path.name} is missing, but SHA256SUMS"):
+            read_model(tmp_path)
+        path.write_bytes(content)
+    read_model(tmp_path)
+
+
+def test_a_summary_of_more_than_a_hundred_megabytes_is_none(tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_bytes(b"{}" + 10**8 * b" ")
+    try:
+        with pytest.raises(InputError, match="summary.json is damaged"):
+            read_summary(tmp_path)
+    finally:
+        path.unlink()
+
+
 def test_lengths_are_words_with_two_digits():
     assert length_words(0.01234, "metre") == "12 mm"
     assert length_words(0.0956, "metre") == "96 mm"
@@ -174,6 +209,14 @@ def height_map():
         max_gap=0.75,
         origin=np.array([[1, 1, 0], [1, 2, 1]], dtype=np.uint8),
     )
+
+
+def test_a_map_names_the_package_that_it_lacks(height_map, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tifffile", None)
+    words = r"^writing GeoTIFF needs the package tifffile: pip install '\.\[inspect\]'"
+    with pytest.raises(MissingPackageError, match=words):
+        write_height_tiff(height_map, tmp_path / "h.tif", "local", "metre")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("unit", ["metre", "scale arbitrary"])

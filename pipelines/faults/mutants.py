@@ -65,7 +65,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "evaluate.py": ("test_comparison.py",),
     },
     "summary": {
-        "export/summary.py": _SUMMARY,
+        "export/summary.py": (*_SUMMARY, "test_images_counted.py"),
         "export/verdict_summary.py": _SUMMARY,
         "export/halves_summary.py": _SUMMARY,
         "calibration/tilt.py": ("test_tilt.py",),

@@ -24,7 +24,8 @@ class Quantity:
     slope: Array
     """(k, 3) its derivative by every place."""
     flatness: Array | None = None
-    """(k,) distances of the places from the plane that was fitted, metres."""
+    """(k,) distances of the places from the plane that was fitted, metres: positive
+    where an area's corners go round counter-clockwise, and where a height's top is."""
     notes: tuple[str, ...] = field(default=())
 
 
