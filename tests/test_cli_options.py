@@ -96,7 +96,7 @@ COMMANDS = {
     ),
     "dense": (
         "out --images photos --voxel 0.002 --min-views 3 --keep-single --noise-px 0.7 "
-        "--max-memory 5GB --threads 4 --quality low",
+        "--max-memory 5GB --threads 4 --quality low --matcher patchmatch",
         "uwsfm.dense.run dense_cloud",
         (Path("out"), Path("photos")),
         None,
@@ -108,6 +108,7 @@ COMMANDS = {
             "max_memory": 5 * 10**9,
             "num_threads": 4,
             "quality": "low",
+            "matcher": "patchmatch",
         },
     ),
     "measure": (

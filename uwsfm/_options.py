@@ -234,7 +234,7 @@ def unknown(name: str, known: Sequence[str]) -> str:
 
 def documented(kind: type[Kind]) -> type[Kind]:
     """Add all options of a dataclass to its docstring, for those who use Python."""
-    lines = [kind.__doc__ or "", "", "Options by name, with their defaults:", ""]
+    lines = [kind.__doc__ or "", "", "Args:"]
     wrapper = textwrap.TextWrapper(
         88, initial_indent=4 * " ", subsequent_indent=8 * " "
     )

@@ -10,7 +10,8 @@ from uwsfm.cli_options import SchedulerOption
 
 def batch(
     dives: Annotated[
-        Path, typer.Argument(help="The YAML file of the dives, see the README.")
+        Path,
+        typer.Argument(help="YAML file of the dives, see docs/howto/many_dives.md."),
     ],
     scheduler: SchedulerOption = "local",
     threads: Annotated[

@@ -28,8 +28,8 @@ def measure(
         Path | None,
         typer.Argument(
             help="A YAML file of what to measure: distances, polylines, areas, "
-            "heights, angles and scale bars, see the README. Default: one distance, "
-            "--from and --to.",
+            "heights, angles and scale bars, see docs/howto/measuring.md. Default: one "
+            "distance, --from and --to.",
             show_default=False,
         ),
     ] = None,

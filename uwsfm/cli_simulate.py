@@ -134,7 +134,7 @@ def simulate_observations(
     Observations: xy, camera_idx, frame_idx, point_idx. Truth: true_xy, is_outlier,
     points, rig_from_world, cam_from_rig, port_rows; the lenses are camera_model,
     camera_size and camera_params. uwsfm.simulate.read_observations makes a Scene of
-    them, for uwsfm.calibrate in Python: see the README.
+    them, for uwsfm.calibrate in Python: see docs/howto/python.md.
     """
     from uwsfm.simulate.commands import simulate_observations as run
 

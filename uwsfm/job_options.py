@@ -50,8 +50,8 @@ class ConstraintOptions(Checked):
     )
     lengths: Path | None = option(
         None,
-        help="Scale bars and distances between frames: a YAML file, see the README. "
-        "Default: no lengths besides those of the rig.",
+        help="Scale bars and distances between frames: a YAML file, see "
+        "docs/howto/scale.md. Default: no lengths besides those of the rig.",
     )
     scene_distance_m: float | None = option(
         None,

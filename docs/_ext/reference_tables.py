@@ -28,7 +28,8 @@ from uwsfm.rig_values import ACCURACIES
 
 PAGES_OF_API = {
     "Run a whole job": "reconstruct refine_model calibrate_housing run_batch "
-    "check_halves dense_cloud MatchOptions StartOptions",
+    "check_halves dense_cloud ReconstructOptions RefineOptions CalibrateHousingOptions "
+    "MatchOptions StartOptions",
     "Read a rig and a result": "load_rig Rig open_result Result read_model Model "
     "write_report",
     "Cameras and ports": "RefractiveCamera FlatPort DomePort NoPort Status",
