@@ -1,5 +1,6 @@
 """What is measured between places of a small dive, beside a calculator."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import pytest
 from measured import clicks_on, one, small_result
 
 from uwsfm.calibration.propagation import Propagation
+from uwsfm.errors import InputError
 from uwsfm.measuring.measure import (
     measure,
 )
@@ -40,6 +42,17 @@ def test_known_figures_are_measured(result):
     }
     for key, (task, value) in expected.items():
         assert one(result, **{key: [task]}).value == pytest.approx(value, rel=1e-9)
+
+
+def test_a_report_holds_the_summary_and_is_never_written_over(result, tmp_path):
+    path, content = tmp_path / "r.json", {"version": 1, "distances": [{"ends": [1, 5]}]}
+    found = measure(result, content, path)
+    assert json.loads(path.read_text()) == found.summary
+    assert found.summary["measurements"][0]["value"] == found.measurements[0].value
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"r\.json"):
+        measure(result, content, path)
+    assert path.read_bytes() == before
 
 
 def test_an_angle_and_its_deviations_are_degrees(result):
