@@ -8,7 +8,7 @@ from pathlib import Path
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """The command line as a user starts it."""
     return subprocess.run(
-        [sys.executable, "-c", "from uwsfm.cli import main; main()", *arguments],
+        [sys.executable, "-c", "from uwsfm.cli.app import main; main()", *arguments],
         capture_output=True,
         text=True,
         cwd=cwd,

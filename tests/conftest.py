@@ -8,7 +8,7 @@ import pytest
 from result_folders import DiveResult, refined_dive
 
 from uwsfm.errors import MissingPackageError
-from uwsfm.first_run import compile_kernels
+from uwsfm.jobs.compile_kernels import compile_kernels
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -27,7 +27,7 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 @pytest.fixture(scope="session")
 def open3d() -> ModuleType:
     """Open3D; where it cannot be imported, the test is skipped with the reason."""
-    from uwsfm._packages import import_package
+    from uwsfm._base.packages import import_package
 
     try:
         return import_package("open3d", "this test", "render")

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from sfm_scenes import model_of
 
-from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import closest_points
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.jobs.refine_model import refine_model
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.refine_pipeline import refine_model
-from uwsfm.rig_file import dump_rig
+from uwsfm.results.files import export_colmap
+from uwsfm.rig.file import dump_rig
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 from sfm_scenes import model_of
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
-from uwsfm.sfm.background import quiet_colmap
+from uwsfm.sfm.frontend.background import quiet_colmap
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig

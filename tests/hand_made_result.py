@@ -16,8 +16,8 @@ from uwsfm.calibration.problem import (
     InAll,
     SolveHistory,
 )
-from uwsfm.colmap import Model
-from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.colmap.model import Model
+from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene

@@ -7,7 +7,7 @@ import pycolmap
 
 from uwsfm import DomePort, FlatPort, NoPort
 from uwsfm.geometry import unit_vector
-from uwsfm.models.port import Port
+from uwsfm.models.ports.port import Port
 
 # Published calibrations: COLMAP's documentation (the first three), EuRoC cam0 (RADIAL
 # without its tangential terms; OPENCV, barrel), URIL's StereoPi (OPENCV, pincushion),

@@ -11,7 +11,7 @@ from uwsfm import calibrate
 from uwsfm.measuring.measure import (
     measure,
 )
-from uwsfm.result_folder import Result
+from uwsfm.results.folder import Result
 from uwsfm.simulate.rigs import sample_rig
 
 

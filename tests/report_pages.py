@@ -11,7 +11,7 @@ import numpy as np
 from hand_made import summary
 from hand_made_result import result_of, small_model
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.report.gather import Report, gather
 
 

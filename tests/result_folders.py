@@ -8,10 +8,10 @@ import yaml
 from sfm_scenes import model_of
 
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
-from uwsfm.export.files import export_colmap
-from uwsfm.refine_pipeline import RefineResult, refine_model
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig
+from uwsfm.jobs.refine_model import RefineResult, refine_model
+from uwsfm.results.files import export_colmap
+from uwsfm.rig.file import dump_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig

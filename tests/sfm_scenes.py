@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pycolmap
 
-from uwsfm.colmap import Model
-from uwsfm.demo import sample_dir
-from uwsfm.rig import Rig
-from uwsfm.rig_file import load_rig
+from uwsfm.colmap.model import Model
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.rig.file import load_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.sfm.same_frame import PairMatches
+from uwsfm.sfm.rig_checks.stereo_matches import PairMatches
 from uwsfm.simulate import ObservationOptions, Relief, SimulatedScene, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion

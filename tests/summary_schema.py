@@ -4,7 +4,7 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from uwsfm.export.schema import summary_schema
+from uwsfm.results.schema import summary_schema
 
 
 def schema_faults(summary: dict[str, Any], part: str | None = None) -> list[str]:

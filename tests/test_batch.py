@@ -9,13 +9,13 @@ import pytest
 import yaml
 from sfm_scenes import reduced_images, reduced_rig
 
-from uwsfm.batch import run_batch
-from uwsfm.dives_file import load_dives
+from uwsfm._base.tasks import Workers
 from uwsfm.errors import InputError
-from uwsfm.job_log import LOG
-from uwsfm.job_options import ReconstructOptions
-from uwsfm.rig_file import dump_rig
-from uwsfm.tasks import Workers
+from uwsfm.jobs.batch import run_batch
+from uwsfm.jobs.dives_file import load_dives
+from uwsfm.options.jobs import ReconstructOptions
+from uwsfm.results.log import LOG
+from uwsfm.rig.file import dump_rig
 
 DIVE = {"name": "bow", "rig": "rig.yaml", "images": "wreck/bow"}
 
@@ -149,7 +149,7 @@ def test_a_failed_dive_does_not_stop_the_others(tmp_path):
         [
             sys.executable,
             "-c",
-            "from uwsfm.cli import main; main()",
+            "from uwsfm.cli.app import main; main()",
             "batch",
             str(path),
         ],

@@ -8,12 +8,12 @@ import pytest
 import yaml
 from command_line import one_sentence, run
 
-from uwsfm.check import CHECK, check_result, given_rig
-from uwsfm.cli_check import explanations_table
-from uwsfm.console import console
+from uwsfm.cli.check import explanations_table
+from uwsfm.cli.console import console
 from uwsfm.errors import InputError
-from uwsfm.export.files import RIG_GIVEN
-from uwsfm.job_log import LOG
+from uwsfm.jobs.check import CHECK, check_result, given_rig
+from uwsfm.results.files import RIG_GIVEN
+from uwsfm.results.log import LOG
 from uwsfm.trust.explanation import Explanation
 
 

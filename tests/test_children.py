@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import uwsfm
-from uwsfm import first_run
-from uwsfm._children import import_path, module_command
-from uwsfm.tasks import Workers
+from uwsfm._base.children import import_path, module_command
+from uwsfm._base.tasks import Workers
+from uwsfm.jobs import compile_kernels as first_run
 
 PACKAGE = Path(uwsfm.__file__).resolve().parent
 TRAP = "import os; os._exit(77)\n"

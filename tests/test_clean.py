@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm._ply import read_vertices
+from uwsfm._base.ply import read_vertices
 from uwsfm.cloud import Cloud, read_cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.simulate.relief import Relief

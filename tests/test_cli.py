@@ -15,12 +15,12 @@ from command_line import one_sentence, run
 from filelock import FileLock
 from sfm_scenes import model_of
 
-from uwsfm.console import console
-from uwsfm.export.files import export_colmap
-from uwsfm.export.housing import export_housing
-from uwsfm.pipeline import WORK
-from uwsfm.result_tables import housing_table
-from uwsfm.rig_file import load_rig
+from uwsfm.cli.console import console
+from uwsfm.cli.tables import housing_table
+from uwsfm.jobs.reconstruct import WORK
+from uwsfm.results.files import export_colmap
+from uwsfm.results.housing import export_housing
+from uwsfm.rig.file import load_rig
 from uwsfm.simulate import ObservationOptions, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion
@@ -68,7 +68,9 @@ def test_a_shell_completes_commands_and_options():
     ):
         words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
         environment = {**os.environ, "_UWSFM_COMPLETE": "complete_bash", **words}
-        code = "import sys; sys.argv = ['uwsfm']; from uwsfm.cli import main; main()"
+        code = (
+            "import sys; sys.argv = ['uwsfm']; from uwsfm.cli.app import main; main()"
+        )
         found = subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True,
@@ -121,7 +123,7 @@ def test_help_and_version_import_nothing_heavy():
     )
     code = (
         "import sys; sys.argv = ['uwsfm', '--version']\n"
-        "from uwsfm.cli import main\n"
+        "from uwsfm.cli.app import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         f"print([m for m in {heavy} if m in sys.modules])"

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from uwsfm._options import options_of
-from uwsfm.cli import app
-from uwsfm.job_options import (
+from uwsfm._base.options import options_of
+from uwsfm.cli.app import app
+from uwsfm.measuring.picks import PointPick
+from uwsfm.options.jobs import (
     CalibrateHousingOptions,
     ReconstructOptions,
     RefineOptions,
 )
-from uwsfm.measuring.picks import PointPick
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
 
 KNOWN = "--positions nav.csv --lever-arm 1,-2,3 --lengths bars.yaml"
@@ -40,7 +40,7 @@ COMMANDS = {
         "sequential --matcher paper --mapper pinhole --seed 5 --threads 3 "
         f"--submap-frames 44 --scheduler tcp://host:1 --no-report {KNOWN} "
         f"{CALIBRATION}",
-        "uwsfm.pipeline reconstruct",
+        "uwsfm.jobs.reconstruct reconstruct",
         (Path("rig.yaml"), Path("photos"), Path("out")),
         ReconstructOptions,
         {
@@ -62,7 +62,7 @@ COMMANDS = {
     "refine": (
         "sparse rig.yaml -o out --images photos --database db.db --no-report "
         f"{KNOWN} {CALIBRATION}",
-        "uwsfm.refine_pipeline refine_model",
+        "uwsfm.jobs.refine_model refine_model",
         (Path("sparse"), Path("rig.yaml"), Path("out")),
         RefineOptions,
         {
@@ -77,7 +77,7 @@ COMMANDS = {
         "rig.yaml photos -o out --strategy nested --error point_3d --start paper "
         "--matcher paper --fundamental-max-error 9 --mapper refractive --max-features "
         f"777 --seed 5 --threads 3 {KNOWN} {CALIBRATION}",
-        "uwsfm.housing_pipeline calibrate_housing",
+        "uwsfm.jobs.calibrate_housing calibrate_housing",
         (Path("rig.yaml"), Path("photos"), Path("out")),
         CalibrateHousingOptions,
         {

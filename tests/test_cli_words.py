@@ -12,9 +12,9 @@ import pytest
 import typer
 
 import uwsfm
-from uwsfm._options import options_of
-from uwsfm.cli import START, app
-from uwsfm.job_options import (
+from uwsfm._base.options import options_of
+from uwsfm.cli.app import START, app
+from uwsfm.options.jobs import (
     CalibrateHousingOptions,
     ReconstructOptions,
     RefineOptions,

@@ -8,11 +8,11 @@ import pytest
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.colmap import Model, to_reconstruction
-from uwsfm.export.files import depth_stddev, export_colmap, export_ply, read_model
-from uwsfm.export.housing import export_housing
-from uwsfm.export.summary import write_json
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.geometry import rigid3
+from uwsfm.results.files import depth_stddev, export_colmap, export_ply, read_model
+from uwsfm.results.housing import export_housing
+from uwsfm.results.summary import write_json
 from uwsfm.simulate.observations import ObservationOptions, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion

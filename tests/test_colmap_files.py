@@ -14,9 +14,9 @@ from hostile import CASES, copied, needs_cases, small_model, written
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.colmap import read_reconstruction
-from uwsfm.colmap_files import check_model_files
-from uwsfm.sfm.refractive_colmap import rig_of_refractive_colmap
+from uwsfm.colmap.files import check_model_files
+from uwsfm.colmap.model import read_reconstruction
+from uwsfm.sfm.from_colmap.refractive_colmap import rig_of_refractive_colmap
 
 FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 
@@ -176,7 +176,7 @@ def test_an_empty_file_is_refused_within_a_second_of_work(tmp_path):
     (folder / "images.bin").write_bytes((model / "images.bin").read_bytes())
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (30, 30))\n"
-        "from uwsfm.cli import main; main()"
+        "from uwsfm.cli.app import main; main()"
     )
     rig = CASES / "models" / "rig.yaml"
     arguments = ["refine", str(folder), str(rig), "-o", str(tmp_path / "out")]

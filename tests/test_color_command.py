@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from uwsfm._ply import read_vertices
-from uwsfm.cli import app
+from uwsfm._base.ply import read_vertices
+from uwsfm.cli.app import app
 from uwsfm.cloud import Cloud, read_cloud, write_cloud
 from uwsfm.color.commands import correct_colors
 from uwsfm.color.encoding import light_of, values_of
 from uwsfm.errors import UwsfmError
-from uwsfm.export.files import read_model
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.geometry import rigid3
+from uwsfm.results.files import read_model
 
 ATTENUATION, BACKSCATTER = np.array([0.4, 0.2, 0.12]), np.array([0.4, 0.35, 0.3])
 VEIL = np.array([0.05, 0.12, 0.2])

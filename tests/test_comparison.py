@@ -10,9 +10,9 @@ from hand_made import dome_camera, flat_camera
 from hand_made_result import result_of, small_model
 
 from uwsfm.errors import InputError
-from uwsfm.evaluate import center_rms, compare_with_truth
 from uwsfm.geometry import rigid3
-from uwsfm.pipeline import ReconstructResult, StartArrays
+from uwsfm.jobs.evaluate import center_rms, compare_with_truth
+from uwsfm.jobs.reconstruct import ReconstructResult, StartArrays
 from uwsfm.trust.verdict import FITS, Verdict
 
 NAMES = ("0000.jpg", "0001.jpg", "0002.jpg")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from uwsfm.cli_dense import _larger_voxels
+from uwsfm.cli.dense import _larger_voxels
 from uwsfm.dense.plan import Load, fused_bytes, plan
 from uwsfm.errors import InputError
 

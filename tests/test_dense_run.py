@@ -12,14 +12,14 @@ from dense_scenes import DenseDive, dense_dive, range_errors
 from typer.testing import CliRunner
 
 import uwsfm
-from uwsfm._disk import DiskFullError
-from uwsfm.cli import app
+from uwsfm._base.disk import DiskFullError
+from uwsfm.cli.app import app
 from uwsfm.dense import maps, stereo_maps
 from uwsfm.dense.depth_map import DepthMap
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.export.files import WORK
-from uwsfm.job_log import LOG
 from uwsfm.residuals import border
+from uwsfm.results.files import WORK
+from uwsfm.results.log import LOG
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def _room_is_asked_for(dive: DenseDive, monkeypatch) -> None:
     # Names, shapes and the key take less than two kilobytes.
     assert 0 <= missing * size - asked.missing_bytes() < 2000 * missing
     with monkeypatch.context() as patch:
-        patch.setattr("uwsfm._disk.room", lambda folder: 1_000_000)
+        patch.setattr("uwsfm._base.disk.room", lambda folder: 1_000_000)
         with pytest.raises(DiskFullError, match="making depth maps takes"):
             uwsfm.dense_cloud(dive.out, dive.images, progress=_no_work)
 

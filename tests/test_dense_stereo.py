@@ -11,7 +11,7 @@ from uwsfm.dense.rectify import MAX_DEVIATION_PX, Pair, rectifications
 from uwsfm.dense.stereo import rectified_images, stereo_depth
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.simulate.rigs import known_cam_from_rig, sample_rig, tilted_normal
 

@@ -7,7 +7,7 @@ import pytest
 
 from uwsfm.dense.warp import Placement, depth_there, warp_table, warped
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import DomePort
+from uwsfm.models.ports.port import DomePort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.simulate.rigs import sample_rig
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from uwsfm import InputError, Lengths, Positions, calibrate, verdicts
-from uwsfm.export.summary import outside_summary
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align_heights
-from uwsfm.lengths_file import UNKNOWN_STDDEV_M, load_positions
+from uwsfm.inputs.lengths_file import UNKNOWN_STDDEV_M, load_positions
+from uwsfm.results.summary import outside_summary
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion

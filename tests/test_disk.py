@@ -10,13 +10,13 @@ import pytest
 from command_line import one_sentence
 from hostile import small_model
 
-from uwsfm._disk import DiskFullError, explained, is_full, require_room, room
-from uwsfm._files import replaced_dir
-from uwsfm._partial import PARTIAL
-from uwsfm.colmap import write_model
-from uwsfm.demo import sample_dir
+from uwsfm._base.disk import DiskFullError, explained, is_full, require_room, room
+from uwsfm._base.files import replaced_dir
+from uwsfm._base.partial import PARTIAL
+from uwsfm.colmap.model import write_model
 from uwsfm.errors import InputError
-from uwsfm.sfm.image_features import scratch_bytes
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.sfm.frontend.image_features import scratch_bytes
 from uwsfm.sfm.options import FeatureOptions
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -107,7 +107,7 @@ WRITE = """
 from pathlib import Path
 from uwsfm.errors import UwsfmError
 import pycolmap
-from uwsfm.colmap import write_model
+from uwsfm.colmap.model import write_model
 out = Path(sys.argv[2])
 out.mkdir()
 try:
@@ -132,7 +132,7 @@ def test_a_disk_that_is_full_from_the_start_ends_in_one_sentence(tmp_path):
     """Features of the sample take more than the limit, and COLMAP would abort."""
     out = tmp_path / "out"
     paths = [str(sample_dir() / "rig.yaml"), str(sample_dir() / "images")]
-    code = "from uwsfm.cli import main; main()"
+    code = "from uwsfm.cli.app import main; main()"
     found = limited(code, 3_000_000, "reconstruct", *paths, "-o", str(out))
     one_sentence(found, f"the disk of {out / 'uwsfm-work'} is full: finding features")
     assert [path for path in Path(out).rglob(f"{PARTIAL}*")] == []

@@ -9,7 +9,7 @@ from jacobians import CAMERA_IDS, DOMES, EXAMPLE_CAMERAS
 from scipy.optimize import minimize
 
 from uwsfm import DomePort, FlatPort, InputError, NoPort, RefractiveCamera, Status
-from uwsfm.models.port import port_from_row
+from uwsfm.models.ports.port import port_from_row
 
 EVERY_DOME = pytest.mark.parametrize("port", DOMES.values(), ids=DOMES.keys())
 PINHOLE = pycolmap.Camera(model="SIMPLE_PINHOLE", params=[1000.0, 0.0, 0.0])

@@ -9,16 +9,16 @@ from sfm_scenes import same_frame_matches, simulated_dive
 from test_three_cameras import three_camera_rig
 
 from uwsfm import InputError, calibrate
-from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3, unit_vector
-from uwsfm.rig_file import load_rig
-from uwsfm.sfm.epipolar import ray_gaps_px, relative_pose
-from uwsfm.sfm.features import extract_features
-from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.matching import match_features
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.rig.file import load_rig
+from uwsfm.sfm.frontend.features import extract_features
+from uwsfm.sfm.frontend.images import find_frames
+from uwsfm.sfm.frontend.matching import match_features
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
-from uwsfm.sfm.same_frame import PairMatches
-from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
+from uwsfm.sfm.poses.epipolar import ray_gaps_px, relative_pose
+from uwsfm.sfm.rig_checks.stereo_matches import PairMatches
+from uwsfm.sfm.rig_checks.stereo_scene import same_frame_scene, without_wrong_matches
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.simulate import Relief, SimulatedScene, simulate_scene
 from uwsfm.simulate.observations import ObservationOptions

@@ -13,11 +13,11 @@ from uwsfm import calibrate, error_budget
 from uwsfm.calibration.error_budget import TOGETHER, with_budget
 from uwsfm.calibration.given_errors import given_reach, in_all
 from uwsfm.calibration.given_items import given_items
-from uwsfm.export.summary import budget_summary, housing_summary, scale_summary
-from uwsfm.judgement import housing_warnings
+from uwsfm.cli.tables import budget_table
+from uwsfm.jobs.judgement import housing_warnings
 from uwsfm.report.tables import budget_lines, lengths_note
 from uwsfm.residuals import border
-from uwsfm.result_tables import budget_table
+from uwsfm.results.summary import budget_summary, housing_summary, scale_summary
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion

@@ -12,7 +12,7 @@ from uwsfm import CalibrateOptions, NoPort
 from uwsfm.calibration.priors import border_priors
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.models.lens import param_slots
-from uwsfm.models.port import DOME, FLAT, KIND, NONE
+from uwsfm.models.ports.port import DOME, FLAT, KIND, NONE
 from uwsfm.residuals import point_3d, virtual_camera
 from uwsfm.simulate import (
     ObservationOptions,

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.export.pinhole import (
     PinholeModel,

@@ -9,15 +9,15 @@ import pytest
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
 from uwsfm.export.pinhole_files import export_pinhole, pinhole_report
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.export.scene_ply import export_scene_ply
 from uwsfm.export.warp import warp_maps
-from uwsfm.models.port import Port
-from uwsfm.rig import Rig
-from uwsfm.sfm.refractive_colmap import read_refractive_colmap
+from uwsfm.models.ports.port import Port
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.from_colmap.refractive_colmap import read_refractive_colmap
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion

@@ -7,10 +7,10 @@ import pytest
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.export.refractive_colmap import export_refractive_colmap
-from uwsfm.rig_file import dump_rig
-from uwsfm.sfm.refractive_colmap import (
+from uwsfm.rig.file import dump_rig
+from uwsfm.sfm.from_colmap.refractive_colmap import (
     read_refractive_cameras,
     read_refractive_colmap,
     rig_of_refractive_colmap,

@@ -6,7 +6,7 @@ import pytest
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.export.scene_ply import camera_lines, export_scene_ply
 from uwsfm.geometry import rigid3
 from uwsfm.simulate import ObservationOptions, simulate_scene

@@ -16,7 +16,7 @@ from command_line import one_sentence, run
 from sfm_scenes import model_of
 from test_export_pinhole import simulated, write_images
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError
 from uwsfm.export.pinhole import pinhole_model
 from uwsfm.export.pinhole_files import export_pinhole

@@ -12,7 +12,7 @@ import uwsfm
 
 # Compiles one small kernel; says where it is kept, and whether it was there already.
 SMALL = """
-from uwsfm._jit import CACHE_DIR
+from uwsfm._base.jit import CACHE_DIR
 from uwsfm.geometry.unit_vector import tangents
 assert tangents(0.0, 0.0, 1.0)[0] == 1.0
 print(CACHE_DIR, sum(tangents.stats.cache_hits.values()))
@@ -36,8 +36,8 @@ import sys
 from pathlib import Path
 import uwsfm
 from uwsfm import first_run
-from uwsfm._jit import CACHE_DIR
-from uwsfm.demo import sample_dir
+from uwsfm._base.jit import CACHE_DIR
+from uwsfm.jobs.demo import sample_dir
 
 def kept():
     return {path.name for path in CACHE_DIR.rglob("*.nbc")}
@@ -117,7 +117,7 @@ def test_a_home_that_cannot_be_written_moves_the_cache(tmp_path):
 
 def test_a_chosen_cache_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    process = start("import uwsfm._jit", UWSFM_CACHE_DIR=str(tmp_path / "file"))
+    process = start("import uwsfm._base.jit", UWSFM_CACHE_DIR=str(tmp_path / "file"))
     errors = process.communicate(timeout=60)[1]
     assert process.returncode != 0
     assert f"UWSFM_CACHE_DIR: cannot write to {tmp_path / 'file'}" in errors
@@ -133,7 +133,7 @@ def test_the_first_run_leaves_nothing_to_compile(tmp_path):
 
 # What an installed command does first, from the folder of its script.
 INSTALLED = """
-from uwsfm.first_run import compile_kernels
+from uwsfm.jobs.compile_kernels import compile_kernels
 from uwsfm import _jit
 assert compile_kernels(2) > 1.0
 print(_jit.__file__, _jit.CACHE_DIR)

@@ -10,11 +10,11 @@ import pytest
 from dense import small_scene
 
 from uwsfm import Distances, Lengths, Positions, Scene
+from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.clicks import with_click_noise
-from uwsfm.calibration.outside import Outside
-from uwsfm.calibration.places import placed
+from uwsfm.calibration.point_placement import placed
 from uwsfm.geometry import rigid3
-from uwsfm.known_lengths import KnownLengths
+from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.solver.state import State
 from uwsfm.solver.terms import centers

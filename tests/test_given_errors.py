@@ -11,7 +11,7 @@ from uwsfm import InputError, calibrate
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.given_errors import given_reach, in_all
-from uwsfm.calibration.reopened import reopened
+from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.scale import scale_slope
 from uwsfm.geometry import unit_vector
 from uwsfm.residuals import border

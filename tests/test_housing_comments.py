@@ -10,8 +10,8 @@ from hand_made_result import camera_covariance, result_of, small_model
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.calibration.named_covariance import NamedCovariance
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.export.housing import export_given_rig, export_housing
-from uwsfm.rig_file import load_rig
+from uwsfm.results.housing import export_given_rig, export_housing
+from uwsfm.rig.file import load_rig
 
 NUMBER = r"\d+(?:\.\d+)?"
 MM = 1e-3

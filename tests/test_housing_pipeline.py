@@ -12,14 +12,14 @@ from sfm_scenes import model_of
 from summary_schema import schema_faults
 
 import uwsfm
-from uwsfm.demo import sample_dir
-from uwsfm.export.files import export_colmap
 from uwsfm.geometry import unit_vector
-from uwsfm.housing_pipeline import calibrate_housing
-from uwsfm.job_log import LOG
-from uwsfm.options_file import OPTIONS
-from uwsfm.output_folder import HOUSING_SUMMARY
-from uwsfm.rig_file import dump_rig
+from uwsfm.jobs.calibrate_housing import calibrate_housing
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.jobs.output_folder import HOUSING_SUMMARY
+from uwsfm.options.file import OPTIONS
+from uwsfm.results.files import export_colmap
+from uwsfm.results.log import LOG
+from uwsfm.rig.file import dump_rig
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion

@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 from sfm_scenes import simulated_dive
 
-from uwsfm.export.summary import _num_images
+from uwsfm.cli.tables import result_table
 from uwsfm.report.words import _images
-from uwsfm.result_tables import result_table
+from uwsfm.results.summary import _num_images
 
 SUMMARY = {
     "num_registered_frames": 14,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwsfm._indices import distinct, renumbered
+from uwsfm._base.indices import distinct, renumbered
 
 
 @pytest.mark.parametrize("size", [40, 100_000])  # many of them occur, and few

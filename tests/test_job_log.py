@@ -5,10 +5,10 @@ import re
 
 import pytest
 
-from uwsfm._progress import silent
+from uwsfm._base.progress import silent
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.job_log import LOG, job_log, log_file
-from uwsfm.output_folder import locked
+from uwsfm.jobs.output_folder import locked
+from uwsfm.results.log import LOG, job_log, log_file
 
 logger = logging.getLogger("uwsfm")
 LINE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING|ERROR) (.*)")

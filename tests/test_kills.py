@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm._partial import PARTIAL
+from uwsfm._base.partial import PARTIAL
 
 FOLDER = Path(__file__).parent.parent / "pipelines" / "faults"
 sys.path.insert(0, str(FOLDER))

@@ -5,8 +5,8 @@ from dense import small_scene
 
 from uwsfm import InputError, calibrate
 from uwsfm.geometry import rigid3
-from uwsfm.known_lengths import KnownLengths
-from uwsfm.lengths_file import load_positions
+from uwsfm.inputs.known_lengths import KnownLengths
+from uwsfm.inputs.lengths_file import load_positions
 from uwsfm.simulate.rigs import sample_rig
 
 HEADER = "frame,x,y,z,sx,sy,sz\n"

@@ -7,8 +7,8 @@ import pytest
 
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.errors import InputError, MissingPackageError
+from uwsfm.export.las import offsets_and_scale, write_las
 from uwsfm.surface.commands import export_las
-from uwsfm.surface.las import offsets_and_scale, write_las
 
 laspy = pytest.importorskip("laspy")
 

@@ -5,15 +5,15 @@ import sys
 
 import pytest
 
-from uwsfm._last_words import is_out_of_memory, unexpected
+from uwsfm._base.last_words import is_out_of_memory, unexpected
 
 FAULT = """
 import sys
-import uwsfm._files
+import uwsfm._base.files
 from uwsfm import cli
 def broken(*_, **__):
     raise {error}
-uwsfm._files.replaced_file = broken
+uwsfm._base.files.replaced_file = broken
 sys.argv = ["uwsfm", {options} "init", "r.yaml"]
 cli.main()
 """

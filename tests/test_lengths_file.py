@@ -23,15 +23,15 @@ from test_outside import (
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm._options import option_named
+from uwsfm._base.options import option_named
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.cli_options import vector_of
-from uwsfm.export.files import export_colmap
+from uwsfm.cli.options import vector_of
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
-from uwsfm.known_lengths import KnownLengths
-from uwsfm.lengths_file import load_lengths, load_positions
-from uwsfm.rig_file import dump_rig
+from uwsfm.inputs.known_lengths import KnownLengths
+from uwsfm.inputs.lengths_file import load_lengths, load_positions
+from uwsfm.results.files import export_colmap
+from uwsfm.rig.file import dump_rig
 from uwsfm.simulate import perturbed
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion

@@ -10,8 +10,8 @@ from hand_made_result import small_model
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.known_lengths import KnownLengths, image_index
-from uwsfm.lengths_file import load_lengths, load_positions
+from uwsfm.inputs.known_lengths import KnownLengths, image_index
+from uwsfm.inputs.lengths_file import load_lengths, load_positions
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ from uwsfm.models.lens import (
     with_limit,
 )
 from uwsfm.residuals import border
-from uwsfm.rig import camera_from_colmap
-from uwsfm.sfm.lens_mistakes import lens_corrections
+from uwsfm.rig.rig import camera_from_colmap
+from uwsfm.sfm.rig_checks.lens_mistakes import lens_corrections
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.trust.central import fit_central, fit_lens
 

@@ -10,13 +10,13 @@ import pytest
 from sfm_scenes import model_of, simulated_dive
 from typer.testing import CliRunner
 
-from uwsfm._ply import read_vertices, write_ply
-from uwsfm.cli import app
+from uwsfm._base.ply import read_vertices, write_ply
+from uwsfm.cli.app import app
 from uwsfm.cloud import UNKNOWN_UNIT, Cloud, read_cloud, write_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import export_colmap, export_ply, unit_of_model
-from uwsfm.export.housing import export_housing
 from uwsfm.geometry import rigid3
+from uwsfm.results.files import export_colmap, export_ply, unit_of_model
+from uwsfm.results.housing import export_housing
 from uwsfm.simulate.relief import Relief
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.surface.commands import make_map

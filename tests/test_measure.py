@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.cli import app
+from uwsfm.cli.app import app
+from uwsfm.cli.console import console
 from uwsfm.cloud import Cloud, write_cloud
-from uwsfm.console import console
 from uwsfm.geometry import rigid3
 from uwsfm.measuring.measure import agreement, unit_hint
 from uwsfm.measuring.surface import Surface, SurfaceImage

@@ -12,7 +12,7 @@ from uwsfm.calibration.propagation import Propagation
 from uwsfm.cloud import Cloud, read_cloud, write_cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.lengths_file import Click
+from uwsfm.inputs.lengths_file import Click
 from uwsfm.measuring.measurements_file import Task
 from uwsfm.measuring.picks import PixelPick, PointPick
 from uwsfm.measuring.spots import Spotter

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from test_map import HOLE, RELIEF, SPACING, WORLD_FROM_FLOOR, floor_cloud
 
-from uwsfm._ply import read_vertices
+from uwsfm._base.ply import read_vertices
 from uwsfm.cloud import write_cloud
 from uwsfm.errors import InputError, MissingPackageError, UwsfmError
 from uwsfm.geometry import rigid3

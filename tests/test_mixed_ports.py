@@ -18,11 +18,11 @@ from uwsfm import (
     verdicts,
 )
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.export.housing import export_housing
-from uwsfm.export.summary import budget_summary, housing_summary
-from uwsfm.judgement import housing_warnings
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig
+from uwsfm.jobs.judgement import housing_warnings
+from uwsfm.results.housing import export_housing
+from uwsfm.results.summary import budget_summary, housing_summary
+from uwsfm.rig.file import dump_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate import (
     ObservationOptions,
     Perturbation,

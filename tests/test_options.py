@@ -13,16 +13,16 @@ from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm._options import group, option, option_named, options_of
-from uwsfm.cli import app
-from uwsfm.cli_options import NOT_GIVEN, takes
-from uwsfm.dives_file import DiveEntry, OptionsEntry, options_entry
-from uwsfm.job_options import (
+from uwsfm._base.options import group, option, option_named, options_of
+from uwsfm.cli.app import app
+from uwsfm.cli.options import NOT_GIVEN, takes
+from uwsfm.jobs.dives_file import DiveEntry, OptionsEntry, options_entry
+from uwsfm.options.file import OPTIONS, write_options
+from uwsfm.options.jobs import (
     CalibrateHousingOptions,
     ReconstructOptions,
     RefineOptions,
 )
-from uwsfm.options_file import OPTIONS, write_options
 from uwsfm.report.command import command_line
 from uwsfm.sfm.options import MatchOptions, StartOptions
 

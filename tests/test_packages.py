@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from uwsfm._packages import import_package
+from uwsfm._base.packages import import_package
 from uwsfm.errors import MissingPackageError
 
 

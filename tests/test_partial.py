@@ -6,16 +6,16 @@ import subprocess
 import sys
 import tempfile
 
-from uwsfm import _partial
-from uwsfm._files import replaced_dir, replaced_file
-from uwsfm._partial import PARTIAL, partial_prefix, remove_stale, scratch_folder
-from uwsfm.output_folder import locked
+from uwsfm._base import partial as _partial
+from uwsfm._base.files import replaced_dir, replaced_file
+from uwsfm._base.partial import PARTIAL, partial_prefix, remove_stale, scratch_folder
+from uwsfm.jobs.output_folder import locked
 
 KILLED = """
 import os, sys
 from pathlib import Path
-from uwsfm._files import replaced_dir, replaced_file
-from uwsfm._partial import scratch_folder
+from uwsfm._base.files import replaced_dir, replaced_file
+from uwsfm._base.partial import scratch_folder
 out = Path(sys.argv[1])
 with (
     replaced_file(out / "deep" / "a.txt") as a,

@@ -11,7 +11,7 @@ from test_outside import ARM, NAV_STDDEV, dive, tracked
 from uwsfm import CalibrateOptions, Lengths, Positions, calibrate
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.propagation import Propagation
-from uwsfm.calibration.reopened import reopened
+from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.uncertainty import likelihood, prior_covariance
 from uwsfm.geometry import rigid3
 from uwsfm.measuring.measure import _Known

@@ -11,7 +11,7 @@ from sfm_scenes import model_of
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm._paths import inside
+from uwsfm._base.paths import inside
 from uwsfm.export.pinhole_files import export_pinhole
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.export.warp import write_image

@@ -9,9 +9,9 @@ from test_calibrate import FAR_OFF, errors_of
 
 from uwsfm import InputError, RefractiveCamera, calibrate
 from uwsfm.calibration.perspective import perspective_adjustment
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import paper_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion

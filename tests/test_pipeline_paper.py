@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm.tasks import Workers
+from uwsfm._base.tasks import Workers
 
 pytest.importorskip("matplotlib")
 

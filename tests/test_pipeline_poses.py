@@ -28,7 +28,7 @@ def test_trials_hold_what_they_say(port):
     from pose_trials import absolute_trial, relative_trial
 
     from uwsfm.geometry import rigid3
-    from uwsfm.sfm.epipolar import ray_gaps_px
+    from uwsfm.sfm.poses.epipolar import ray_gaps_px
 
     trial = absolute_trial(port, 0.5, 3)
     in_cam = rigid3.transform(trial.cam_from_world, trial.points)

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 import uwsfm
-from uwsfm.demo import sample_dir
+from uwsfm.jobs.demo import sample_dir
 
 ROOT = Path(__file__).parent.parent
 PIPELINES = ROOT / "pipelines"

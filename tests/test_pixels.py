@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from uwsfm.demo import sample_dir
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.sfm.background import damaged
-from uwsfm.sfm.images import find_frames, range_warnings
-from uwsfm.sfm.pixels import image_fault, read_color, read_gray, value_range
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.sfm.frontend.background import damaged
+from uwsfm.sfm.frontend.images import find_frames, range_warnings
+from uwsfm.sfm.frontend.pixels import image_fault, read_color, read_gray, value_range
 from uwsfm.simulate.rigs import sample_rig
 
 RAMP = np.linspace(0.0, 1.0, 80 * 60).reshape(60, 80)
@@ -136,7 +136,7 @@ def test_libraries_say_nothing_of_their_own(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
         "from uwsfm.errors import InputError\n"
-        "from uwsfm.sfm.pixels import image_fault\n"
+        "from uwsfm.sfm.frontend.pixels import image_fault\n"
         "for name in ('a.tiff', 'a.png', 'a.jpg'):\n"
         "    try: print(image_fault(Path(sys.argv[1]) / name, (80, 60)))\n"
         "    except InputError as error: print(error)\n"

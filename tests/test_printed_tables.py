@@ -5,10 +5,8 @@ import math
 import pytest
 from hand_made import flat_camera, numbers, printed, quantity, summary, unit_in
 
-from uwsfm.batch import Outcome
-from uwsfm.console import NO_CAUSE, ProgressBars, console, errors, print_verdict
-from uwsfm.evaluate import CameraComparison, Comparison, DomeComparison
-from uwsfm.result_tables import (
+from uwsfm.cli.console import NO_CAUSE, ProgressBars, console, errors, print_verdict
+from uwsfm.cli.tables import (
     BUDGET_ROWS,
     MAX_IMAGE_ROWS,
     batch_table,
@@ -20,6 +18,8 @@ from uwsfm.result_tables import (
     result_table,
     timings_table,
 )
+from uwsfm.jobs.batch import Outcome
+from uwsfm.jobs.evaluate import CameraComparison, Comparison, DomeComparison
 
 MM, DEG = 1e-3, math.pi / 180.0
 
@@ -397,7 +397,7 @@ def test_progress_goes_to_standard_error_and_ends_well(monkeypatch):
         def close(self, *, complete):
             ended.append(complete)
 
-    monkeypatch.setattr("uwsfm.console.display", lambda where: Display())
+    monkeypatch.setattr("uwsfm.cli.console.display", lambda where: Display())
     with ProgressBars():
         pass
     with pytest.raises(ValueError, match="no"), ProgressBars():

@@ -9,7 +9,7 @@ import pytest
 from command_line import run
 from rich.console import Console
 
-from uwsfm.progress_display import (
+from uwsfm._base.progress_display import (
     HEARTBEAT_SECONDS,
     LINE_SECONDS,
     Bars,

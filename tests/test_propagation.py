@@ -16,7 +16,7 @@ from test_outside import (
 )
 
 from uwsfm import Lengths, calibrate
-from uwsfm.calibration.places import misses, placed
+from uwsfm.calibration.point_placement import misses, placed
 from uwsfm.calibration.propagation import FEATURE, Places, Propagation
 from uwsfm.calibration.uncertainty import clusters_of, posterior_covariance
 from uwsfm.measuring.quantities import area, distance, height

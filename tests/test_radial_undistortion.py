@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from uwsfm.errors import InputError
-from uwsfm.export.summary import housing_summary
 from uwsfm.models.lens import dir_from_img, lens_row
 from uwsfm.models.radial_undistortion import convert_radial_undistortion
-from uwsfm.rig import camera_from_colmap
-from uwsfm.rig_file import dump_rig, load_rig, template
+from uwsfm.results.summary import housing_summary
+from uwsfm.rig.file import dump_rig, load_rig, template
+from uwsfm.rig.rig import camera_from_colmap
 
 LENSES = {
     "mild": ((1200, 900), (1000, 1000, 600, 450), (0.08, -0.02)),

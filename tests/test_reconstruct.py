@@ -14,9 +14,9 @@ from summary_schema import schema_faults
 
 import uwsfm
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.demo import MAX_FEATURES, run_demo, sample_dir
-from uwsfm.evaluate import Comparison, compare_with_truth
-from uwsfm.pipeline import ReconstructResult
+from uwsfm.jobs.demo import MAX_FEATURES, run_demo, sample_dir
+from uwsfm.jobs.evaluate import Comparison, compare_with_truth
+from uwsfm.jobs.reconstruct import ReconstructResult
 from uwsfm.sfm.refine import rig_options
 
 

@@ -9,19 +9,9 @@ import pytest
 from uwsfm import CalibrateOptions
 from uwsfm.calibration.uncertainty import likelihood
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.simulate import Perturbation, SurveySpec, perturbed, simulate_survey
-from uwsfm.solver import (
-    block_cholesky,
-    nested_dissection,
-    reduced_steps,
-    schur,
-    threads,
-)
-from uwsfm.solver import elimination_tree as trees
-from uwsfm.solver import reduced_factor as factors
-from uwsfm.solver import reduction as reductions
-from uwsfm.solver.block_graph import build_graph
+from uwsfm.solver import threads
 from uwsfm.solver.covariance import point_covariances, reduced_covariance
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import (
@@ -29,9 +19,14 @@ from uwsfm.solver.levenberg_marquardt import (
     Priors,
     minimize,
 )
-from uwsfm.solver.quasidefinite import symmetric
-from uwsfm.solver.reduced_steps import TOLERANCE, StepSolver
-from uwsfm.solver.reduction import BANDED, DENSE, SPARSE, analyse
+from uwsfm.solver.linear import block_cholesky, nested_dissection, reduced_steps, schur
+from uwsfm.solver.linear import elimination_tree as trees
+from uwsfm.solver.linear import reduced_factor as factors
+from uwsfm.solver.linear import reduction as reductions
+from uwsfm.solver.linear.block_graph import build_graph
+from uwsfm.solver.linear.quasidefinite import symmetric
+from uwsfm.solver.linear.reduced_steps import TOLERANCE, StepSolver
+from uwsfm.solver.linear.reduction import BANDED, DENSE, SPARSE, analyse
 from uwsfm.solver.state import State
 from uwsfm.solver.terms import LengthTerm, PositionTerm, centers
 

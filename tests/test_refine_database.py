@@ -10,10 +10,10 @@ from foreign_models import NUM_FRAMES, Dive, self_calibrated, simulated_dive, wr
 
 import uwsfm
 from uwsfm.geometry import unit_vector
-from uwsfm.rig import Rig
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.colmap_model import FoundModel, read_image_model
-from uwsfm.sfm.model_database import read_image_database
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.from_colmap.colmap_model import FoundModel, read_image_model
+from uwsfm.sfm.from_colmap.model_database import read_image_database
+from uwsfm.sfm.frontend.background import opened
 
 LOST = {(0, 3), (1, 3), (0, 8), (1, 8), (1, 5)}
 """(camera, frame) of images that the model has not registered."""

@@ -18,13 +18,13 @@ from test_three_cameras import dive as three_camera_dive
 from test_three_cameras import three_camera_rig
 
 import uwsfm
-from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3, unit_vector
-from uwsfm.job_log import LOG
-from uwsfm.output_folder import RESULTS, WORK
+from uwsfm.jobs.output_folder import RESULTS, WORK
 from uwsfm.report.files import FOLDER, PAGE
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig
+from uwsfm.results.files import export_colmap
+from uwsfm.results.log import LOG
+from uwsfm.rig.file import dump_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig
 from uwsfm.simulate.trajectories import straight_strip
@@ -236,7 +236,7 @@ def test_the_error_of_a_refractive_model_as_a_pinhole_is_not_told(dive, tmp_path
 
 
 def test_the_command_line_refines_a_model(dive, tmp_path, capsys, monkeypatch):
-    from uwsfm import cli
+    from uwsfm.cli import app as cli
 
     plain = write(self_calibrated(dive.model), tmp_path / "model", old=True)
     dump_rig(dive.rig, tmp_path / "rig.yaml")

@@ -10,9 +10,9 @@ from hostile import CASES, copied, needs_cases
 from test_refine_database import write_database
 
 import uwsfm
-from uwsfm.rig_file import load_rig
-from uwsfm.sfm.colmap_model import FoundModel, read_image_model
-from uwsfm.sfm.model_points import triangulated
+from uwsfm.rig.file import load_rig
+from uwsfm.sfm.from_colmap.colmap_model import FoundModel, read_image_model
+from uwsfm.sfm.from_colmap.model_points import triangulated
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from foreign_models import NUM_FRAMES, Dive, self_calibrated, simulated_dive, wr
 from sfm_scenes import model_of
 
 import uwsfm
-from uwsfm.export.files import export_colmap
 from uwsfm.geometry import rigid3
+from uwsfm.results.files import export_colmap
 
 
 @pytest.fixture(scope="module")

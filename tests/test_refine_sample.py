@@ -7,9 +7,9 @@ import pytest
 from foreign_models import stock_model, write
 
 import uwsfm
-from uwsfm.demo import sample_dir
-from uwsfm.evaluate import center_rms
 from uwsfm.geometry import unit_vector
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.jobs.evaluate import center_rms
 
 pytestmark = pytest.mark.slow
 

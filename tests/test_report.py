@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.cli import app
+from uwsfm.cli.app import app
 from uwsfm.geometry import rigid3
-from uwsfm.job_options import ReconstructOptions
+from uwsfm.options.jobs import ReconstructOptions
 from uwsfm.report.command import command_line
 from uwsfm.report.files import FOLDER, NUMBERS, PAGE, write_with_report
 from uwsfm.report.gather import gather

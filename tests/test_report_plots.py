@@ -12,11 +12,11 @@ from hand_made_residuals import camera, residuals
 from hand_made_result import FRAMES, result_of
 from report_pages import model_that_misses, payload_of, report_of, text_of
 
-from uwsfm.export.files import depth_stddev
 from uwsfm.geometry import rigid3
 from uwsfm.report.gather import _coverage, numbers_of
 from uwsfm.report.page import page_of, scales_of
 from uwsfm.report.view import level_axes, strips, view_of
+from uwsfm.results.files import depth_stddev
 
 
 @pytest.fixture(scope="module")

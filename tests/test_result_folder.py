@@ -9,9 +9,9 @@ import pytest
 
 import uwsfm
 from uwsfm import InputError
-from uwsfm.export.calibration_file import read_calibration
-from uwsfm.output_folder import locked, made_of_files, output_folder
-from uwsfm.result_folder import fingerprint_of
+from uwsfm.jobs.output_folder import locked, made_of_files, output_folder
+from uwsfm.results.calibration_file import read_calibration
+from uwsfm.results.folder import fingerprint_of
 
 
 def assert_same(found, expected):

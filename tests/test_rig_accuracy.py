@@ -9,7 +9,7 @@ import yaml
 from given_changes import scaled_accuracy
 
 from uwsfm import calibrate
-from uwsfm._options import option_named
+from uwsfm._base.options import option_named
 from uwsfm.calibration import given_accuracy as defaults
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.given_accuracy import (
@@ -19,14 +19,14 @@ from uwsfm.calibration.given_accuracy import (
 )
 from uwsfm.calibration.problem import PRIORS
 from uwsfm.calibration.tilt import paper_tilt
-from uwsfm.cli_options import numbers_of
+from uwsfm.cli.options import numbers_of
 from uwsfm.errors import InputError
-from uwsfm.export.housing import export_housing
-from uwsfm.job_options import ReconstructOptions
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.options.jobs import ReconstructOptions
 from uwsfm.residuals import border
-from uwsfm.rig_file import dump_rig, load_rig, template
-from uwsfm.rig_values import ACCURACIES
+from uwsfm.results.housing import export_housing
+from uwsfm.rig.file import dump_rig, load_rig, template
+from uwsfm.rig.values import ACCURACIES
 from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rich_motion

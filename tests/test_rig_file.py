@@ -13,10 +13,10 @@ import yaml
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY, quat_from_rotvec, transform
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.rig import Rig, RigCamera, camera_from_colmap
-from uwsfm.rig_file import dump_rig, load_rig, template
+from uwsfm.rig.file import dump_rig, load_rig, template
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
 
 DELETE = object()
 
@@ -348,7 +348,7 @@ def test_files_that_cannot_be_read_are_one_sentence(tmp_path):
 
 def test_the_template_needs_none_of_the_heavy_packages():
     code = (
-        "import sys; from uwsfm.rig_file import template; template(); "
+        "import sys; from uwsfm.rig.file import template; template(); "
         "print({'pycolmap', 'numba', 'cv2', 'scipy'} & set(sys.modules))"
     )
     root = Path(__file__).parents[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
 
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.refine import MAX_ERROR_PX, MAX_START_ERROR_PX, refine_scene
 from uwsfm.sfm.scene_points import (

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
 
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.mapper import map_images
+from uwsfm.sfm.frontend.background import opened
 from uwsfm.sfm.mapping.correspondences import read_correspondences
 from uwsfm.sfm.mapping.incremental import map_incrementally
-from uwsfm.sfm.mapping_database import write_mapping_database
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
+from uwsfm.sfm.pinhole.mapper import map_images
+from uwsfm.sfm.pinhole.mapping_database import write_mapping_database
+from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 

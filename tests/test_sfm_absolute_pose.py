@@ -8,13 +8,13 @@ from jacobians import check_jacobian, tilted
 from uwsfm import DomePort, FlatPort, InputError, RefractiveCamera
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.p3p import poses_from_three
-from uwsfm.sfm.absolute_pose import (
+from uwsfm.sfm.poses.absolute_pose import (
     AbsolutePoseOptions,
     checked,
     estimate_rig_pose,
 )
+from uwsfm.sfm.poses.rig_pose_kernel import normal_equations, pose_cost
 from uwsfm.solver.losses import LOSS_CODES
-from uwsfm.solver.rig_pose import normal_equations, pose_cost
 
 SIZE = np.array([1920.0, 1080.0])
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from uwsfm.geometry import rigid3
-from uwsfm.sfm import baseline
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.baseline import STEP, connected_frames, rig_from_baseline
+from uwsfm.sfm.frontend.background import opened
 from uwsfm.sfm.options import StartOptions
+from uwsfm.sfm.rig_checks import baseline
+from uwsfm.sfm.rig_checks.baseline import STEP, connected_frames, rig_from_baseline
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig

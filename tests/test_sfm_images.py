@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from uwsfm.errors import InputError
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.features import extract_features
-from uwsfm.sfm.image_features import find_features
-from uwsfm.sfm.images import (
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.features import extract_features
+from uwsfm.sfm.frontend.image_features import find_features
+from uwsfm.sfm.frontend.images import (
     check_masks,
     find_frames,
     mask_warnings,

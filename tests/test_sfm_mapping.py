@@ -9,14 +9,14 @@ from sfm_scenes import simulated_dive
 
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.sfm.images import Frames
-from uwsfm.sfm.mapper import map_images
-from uwsfm.sfm.mapping_database import write_mapping_database
+from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.perspective import PerspectiveStart, StartArrays, read_start
-from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
+from uwsfm.sfm.pinhole.mapper import map_images
+from uwsfm.sfm.pinhole.mapping_database import write_mapping_database
+from uwsfm.sfm.pinhole.perspective import PerspectiveStart, StartArrays, read_start
+from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps

@@ -10,8 +10,8 @@ from test_mixed_ports import mixed_rig
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
-from uwsfm.sfm.images import Frames
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.simulated import frames_of, write_features

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import uwsfm
-from uwsfm.evaluate import Comparison, compare_with_truth
+from uwsfm.jobs.evaluate import Comparison, compare_with_truth
 from uwsfm.simulate.sequence import near_spec, render_sequence
 
 pytestmark = pytest.mark.slow

@@ -8,10 +8,10 @@ from sfm_scenes import simulated_dive
 
 from uwsfm.geometry import rigid3
 from uwsfm.scene import Scene
-from uwsfm.sfm.epipolar import ray_gaps_px
 from uwsfm.sfm.mapping import tracks
 from uwsfm.sfm.mapping.tracks import match_gaps_px, triangulate
 from uwsfm.sfm.mapping.triangulation import Views
+from uwsfm.sfm.poses.epipolar import ray_gaps_px
 from uwsfm.solver.state import State
 
 MIN_ANGLE = np.radians(1.5)

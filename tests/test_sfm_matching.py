@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwsfm.sfm.images import Frames
-from uwsfm.sfm.match_blocks import match_block, pair_blocks
-from uwsfm.sfm.matching import frame_pairs, image_pairs
+from uwsfm.sfm.frontend.images import Frames
+from uwsfm.sfm.frontend.match_blocks import match_block, pair_blocks
+from uwsfm.sfm.frontend.matching import frame_pairs, image_pairs
+from uwsfm.sfm.frontend.retrieval import similar_frames
 from uwsfm.sfm.options import MatchOptions
-from uwsfm.sfm.retrieval import similar_frames
 
 
 def dive(num_frames: int) -> Frames:

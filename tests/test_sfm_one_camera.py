@@ -10,10 +10,10 @@ from test_sfm_mapping import center_errors
 
 from uwsfm import DomePort, InputError, calibrate
 from uwsfm.geometry import rigid3
-from uwsfm.pipeline import start_scene
-from uwsfm.rig import Rig
+from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.rig.rig import Rig
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.perspective import StartArrays, read_start
+from uwsfm.sfm.pinhole.perspective import StartArrays, read_start
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches

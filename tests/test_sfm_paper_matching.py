@@ -9,17 +9,17 @@ import numpy as np
 import pycolmap
 import pytest
 
-from uwsfm.demo import sample_dir
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.rig_file import load_rig
-from uwsfm.sfm import paper_matching
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.epipolar import ray_gaps_px
-from uwsfm.sfm.features import extract_features, store_intrinsics
-from uwsfm.sfm.images import Frames, find_frames
-from uwsfm.sfm.matching import image_pairs, match_features
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.rig.file import load_rig
+from uwsfm.sfm.frontend import paper_matching
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.features import extract_features, store_intrinsics
+from uwsfm.sfm.frontend.images import Frames, find_frames
+from uwsfm.sfm.frontend.matching import image_pairs, match_features
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
+from uwsfm.sfm.poses.epipolar import ray_gaps_px
 from uwsfm.simulate.rigs import sample_rig
 
 NUM_FRAMES = 3

@@ -5,11 +5,11 @@ import pycolmap
 import pytest
 
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.sfm.baseline import robust_average, with_baseline
-from uwsfm.sfm.mapping_database import virtual_rig
-from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
+from uwsfm.sfm.pinhole.mapping_database import virtual_rig
+from uwsfm.sfm.rig_checks.baseline import robust_average, with_baseline
+from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
 from uwsfm.simulate.rigs import tilted_normal
 
 DEPTHS = np.array([0.7, 1.0, 1.6])

@@ -10,14 +10,14 @@ from uwsfm import DomePort, InputError, RefractiveCamera
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
 from uwsfm.models.projection import JAC_SIZE
-from uwsfm.sfm.epipolar import ray_gaps_px
-from uwsfm.sfm.kernel_rows import near_rays, rays_in_rig, rig_rows
-from uwsfm.sfm.relative_pose import (
+from uwsfm.sfm.poses.epipolar import ray_gaps_px
+from uwsfm.sfm.poses.kernel_rows import near_rays, rays_in_rig, rig_rows
+from uwsfm.sfm.poses.relative_pose import (
     RelativePoseOptions,
     estimate_relative_pose,
     estimate_rig_relative_poses,
 )
-from uwsfm.solver.rig_pair import gap_with_jac, gaps
+from uwsfm.sfm.poses.relative_pose_kernel import gap_with_jac, gaps
 
 WIDE = np.array([0.02, 0.25, 0.05, -1.2, 0.1, 0.3])
 """A motion [rotation, translation] over a scene at 3 m."""

@@ -15,12 +15,12 @@ import pytest
 from sfm_scenes import reduced_images, reduced_rig
 
 from uwsfm.errors import InputError
-from uwsfm.models.port import FlatPort
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig
-from uwsfm.sfm.background import opened
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.rig.file import dump_rig
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.background import opened
 from uwsfm.sfm.options import FeatureOptions, MatchOptions, StartOptions
-from uwsfm.sfm.perspective import PerspectiveStart, read_start
+from uwsfm.sfm.pinhole.perspective import PerspectiveStart, read_start
 from uwsfm.sfm.start import perspective_start
 
 NUM_FRAMES = 3
@@ -31,8 +31,8 @@ OPTIONS = StartOptions(num_threads=2, mapper="pinhole")
 CHILD = """
 import os, signal, sys
 from pathlib import Path
-import uwsfm.sfm.background as background
-from uwsfm.rig_file import load_rig
+import uwsfm.sfm.frontend.background as background
+from uwsfm.rig.file import load_rig
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.start import perspective_start
 

@@ -11,18 +11,22 @@ from sfm_scenes import same_frame_matches, simulated_dive
 
 from uwsfm.errors import ExplainedInputError, InputError
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import DomePort, NoPort
-from uwsfm.rig import Rig, camera_from_colmap
+from uwsfm.models.ports.port import DomePort, NoPort
+from uwsfm.rig.rig import Rig, camera_from_colmap
 from uwsfm.scene import Scene
-from uwsfm.sfm.rig_check import (
+from uwsfm.sfm.rig_checks.rig_check import (
     MAX_TURN_DEG,
     _apart,
     check_rig,
     check_rotation,
     turn_causes,
 )
-from uwsfm.sfm.rig_rotation import RigRotation, correct_rotations, scene_depths
-from uwsfm.sfm.same_frame import PairMatches
+from uwsfm.sfm.rig_checks.rig_rotation import (
+    RigRotation,
+    correct_rotations,
+    scene_depths,
+)
+from uwsfm.sfm.rig_checks.stereo_matches import PairMatches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig, stereo_rig, tilted_normal
 from uwsfm.trust.mistakes import shifted
 

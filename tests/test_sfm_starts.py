@@ -8,7 +8,7 @@ import pytest
 
 from uwsfm import NoPort, UwsfmError
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
@@ -16,7 +16,10 @@ from uwsfm.sfm.mapping.incremental import map_incrementally
 from uwsfm.sfm.mapping.initialization import PairSearch
 from uwsfm.sfm.noise_floor import map_floor
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.relative_pose import RelativePoseOptions, estimate_rig_relative_poses
+from uwsfm.sfm.poses.relative_pose import (
+    RelativePoseOptions,
+    estimate_rig_relative_poses,
+)
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import rig_from_world_looking_at

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from uwsfm._partial import PARTIAL
+from uwsfm._base.partial import PARTIAL
 from uwsfm.errors import UwsfmError
 from uwsfm.sfm import steps as module
-from uwsfm.sfm.background import remove_database
+from uwsfm.sfm.frontend.background import remove_database
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.steps import Steps, fingerprint
 

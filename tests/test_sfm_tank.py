@@ -10,10 +10,10 @@ import pytest
 
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort
-from uwsfm.rig import Rig, RigCamera, camera_from_opencv
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_opencv
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.perspective import read_start
+from uwsfm.sfm.pinhole.perspective import read_start
 from uwsfm.sfm.start import perspective_start
 
 DATA = Path(os.environ.get("UWSFM_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from uwsfm._signals import STOPPING
+from uwsfm._base.signals import STOPPING
 
 STOPPED = """
 import os, signal, sys, time
@@ -16,7 +16,7 @@ from uwsfm import cli
 
 @cli.app.command()
 def wait():
-    from uwsfm.console import ProgressBars
+    from uwsfm.cli.console import ProgressBars
     with ProgressBars():
         try:
             os.kill(os.getpid(), getattr(signal, name))
@@ -56,7 +56,7 @@ from uwsfm import cli
 
 @cli.app.command()
 def wait():
-    from uwsfm.console import ProgressBars
+    from uwsfm.cli.console import ProgressBars
     with ProgressBars(), ThreadPoolExecutor(1) as pool:
         pool.submit(time.sleep, 2)
         os.kill(os.getpid(), getattr(signal, name))
@@ -83,8 +83,8 @@ def test_a_slow_end_is_announced(name, code):
 STOPPED_WRITING = """
 import json, os, signal, sys
 from typer.testing import CliRunner
-from uwsfm._partial import PARTIAL
-from uwsfm.cli import app
+from uwsfm._base.partial import PARTIAL
+from uwsfm.cli.app import app
 
 def stop(event, arguments):
     if event == "open" and PARTIAL in str(arguments[0]):

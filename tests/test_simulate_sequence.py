@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from uwsfm.cli import main
+from uwsfm.cli.app import main
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.rig.file import dump_rig, load_rig
 from uwsfm.simulate.commands import (
     TRAJECTORIES,
     simulate_images,

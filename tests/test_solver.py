@@ -11,11 +11,12 @@ from uwsfm import CalibrateOptions, InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.residuals.border import BORDER_SIZE, LENGTH
 from uwsfm.simulate import Perturbation, perturbed
-from uwsfm.solver import assembly, chunks, normal_equations, schur
+from uwsfm.solver import assembly, chunks, normal_equations
 from uwsfm.solver import levenberg_marquardt as lm
-from uwsfm.solver.block_graph import build_graph
 from uwsfm.solver.error_models import error_model
 from uwsfm.solver.layout import HELD, build_layout
+from uwsfm.solver.linear import schur
+from uwsfm.solver.linear.block_graph import build_graph
 from uwsfm.solver.losses import INVALID_PX, rho
 from uwsfm.solver.state import State
 from uwsfm.solver.workspace import Workspace

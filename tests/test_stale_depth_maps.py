@@ -11,7 +11,7 @@ from uwsfm.dense.depth_map import DepthMap, write_depth_map
 from uwsfm.dense.maps import DepthMaps
 from uwsfm.dense.stereo_maps import StereoMaps
 from uwsfm.errors import InputError
-from uwsfm.result_folder import Result
+from uwsfm.results.folder import Result
 
 
 @pytest.fixture(scope="module")

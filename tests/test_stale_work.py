@@ -14,10 +14,10 @@ import pytest
 
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.errors import InputError
-from uwsfm.export.calibration_file import fingerprint as model_fingerprint
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.results.calibration_file import fingerprint as model_fingerprint
 from uwsfm.sfm import refractive_steps, start
-from uwsfm.sfm.images import find_frames
+from uwsfm.sfm.frontend.images import find_frames
 from uwsfm.sfm.options import (
     FeatureOptions,
     MappingOptions,

@@ -10,13 +10,13 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.joint_alignment import Link, align_jointly
-from uwsfm.pipeline import start_scene
-from uwsfm.sfm.images import Frames
+from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.options import MappingOptions, StartOptions
 from uwsfm.sfm.refine import Refined, refine_scene

@@ -20,7 +20,9 @@ from hand_made_result import (
 from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
-from uwsfm.export.summary import (
+from uwsfm.models.ports.port import NoPort
+from uwsfm.residuals import border
+from uwsfm.results.summary import (
     budget_summary,
     errors_summary,
     housing_summary,
@@ -28,8 +30,6 @@ from uwsfm.export.summary import (
     refined_summary,
     scale_summary,
 )
-from uwsfm.models.port import NoPort
-from uwsfm.residuals import border
 from uwsfm.solver.layout import build_layout
 
 

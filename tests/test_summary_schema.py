@@ -6,7 +6,7 @@ import re
 from jsonschema import Draft202012Validator
 from summary_schema import schema_faults
 
-from uwsfm.export.schema import SCHEMA_VERSION, summary_schema
+from uwsfm.results.schema import SCHEMA_VERSION, summary_schema
 
 UNIT = re.compile(
     r"pixels|metres|degrees|seconds|ratio|share|unit|variances|deviations|steps",

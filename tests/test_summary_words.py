@@ -10,12 +10,9 @@ from hand_made_result import (
     camera_covariance,
 )
 
-from uwsfm.export.halves_summary import halves_numbers
-from uwsfm.export.summary import (
-    versions,
-    write_json,
-)
-from uwsfm.export.verdict_summary import (
+from uwsfm.results.halves_summary import halves_numbers
+from uwsfm.results.summary import versions, write_json
+from uwsfm.results.verdict_summary import (
     plain,
     shown_word,
     verdict_line,

@@ -17,17 +17,17 @@ import pytest
 from distributed import LocalCluster
 
 import uwsfm
-from uwsfm._signals import STOPPING
-from uwsfm.demo import sample_dir
+from uwsfm._base.signals import STOPPING
+from uwsfm._base.tasks import RETRIES, Workers
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.rig_file import load_rig
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.images import find_frames
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.rig.file import load_rig
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.images import find_frames
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.start import match_images
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.tasks import RETRIES, Workers
 
 
 def square(number: int) -> int:
@@ -151,7 +151,7 @@ def test_no_stranger_reaches_the_processes_of_this_machine(tmp_path):
 def test_where_no_scheduler_is_nothing_is_written(
     scheduler, refusal, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("uwsfm.tasks.CONNECT_SECONDS", 1)  # a refusal takes none
+    monkeypatch.setattr("uwsfm._base.tasks.CONNECT_SECONDS", 1)  # a refusal takes none
     with pytest.raises(InputError, match=refusal):
         uwsfm.reconstruct(
             sample_dir() / "rig.yaml",
@@ -170,8 +170,8 @@ from uwsfm import cli
 @cli.app.command()
 def wait():
     import pycolmap
-    from uwsfm.console import ProgressBars
-    from uwsfm.tasks import Workers
+    from uwsfm.cli.console import ProgressBars
+    from uwsfm._base.tasks import Workers
 
     def start(step, done, total):
         children = psutil.Process().children(recursive=True)
@@ -219,7 +219,7 @@ def test_a_signal_to_the_whole_group_ends_all_processes_without_a_word():
 ORPHANS = """
 import os, psutil, signal, sys, time
 from pathlib import Path
-from uwsfm.tasks import Workers
+from uwsfm._base.tasks import Workers
 
 def kill(step, done, total):
     if done == 1:

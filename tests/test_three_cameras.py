@@ -6,9 +6,9 @@ import numpy as np
 from bounds import assert_near_the_bound
 
 from uwsfm import FlatPort, calibrate
-from uwsfm.colmap import Model, from_reconstruction, to_reconstruction
+from uwsfm.colmap.model import Model, from_reconstruction, to_reconstruction
 from uwsfm.geometry import rigid3, unit_vector
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate import (
     ObservationOptions,
     Perturbation,

@@ -18,8 +18,8 @@ from uwsfm.calibration.observability import (
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
-from uwsfm.sfm.colmap_model import ImageModel
-from uwsfm.sfm.model_rig import _Pairs, _scale
+from uwsfm.sfm.from_colmap.colmap_model import ImageModel
+from uwsfm.sfm.from_colmap.model_rig import _Pairs, _scale
 from uwsfm.simulate.rigs import sample_rig
 
 DOUBTFUL, WRONG = "doubtful", "does not fit"

@@ -16,7 +16,7 @@ from hand_made_result import (
 
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.residuals import border
 
 

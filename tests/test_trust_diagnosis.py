@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from sfm_scenes import simulated_dive
 
-from uwsfm._progress import silent
+from uwsfm._base.progress import silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
-from uwsfm.rig import Rig, RigCamera, camera_from_colmap
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.scene import Scene
 from uwsfm.sfm.correction import CODES
 from uwsfm.sfm.refine import rig_options

@@ -16,24 +16,19 @@ from uwsfm import calibrate
 from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.observability import verdicts
-from uwsfm.check_halves import check_halves, cross_validated
-from uwsfm.cli import app
-from uwsfm.cli_check import halves_table
+from uwsfm.cli.app import app
+from uwsfm.cli.check import halves_table
 from uwsfm.errors import InputError
-from uwsfm.export.files import HOUSING
-from uwsfm.export.halves_summary import KEY, halves_numbers
-from uwsfm.export.summary import housing_summary
 from uwsfm.geometry import rigid3
-from uwsfm.judgement import judged_result
+from uwsfm.jobs.check_halves import check_halves, cross_validated
+from uwsfm.jobs.judgement import judged_result
 from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.residuals import border
-from uwsfm.result_folder import (
-    given_rig,
-    open_result,
-    require_model,
-    store_judgement,
-)
-from uwsfm.rig_file import load_rig
+from uwsfm.results.files import HOUSING
+from uwsfm.results.folder import given_rig, open_result, require_model, store_judgement
+from uwsfm.results.halves_summary import KEY, halves_numbers
+from uwsfm.results.summary import housing_summary
+from uwsfm.rig.file import load_rig
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion

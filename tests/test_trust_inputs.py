@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 
 FOLDER = Path(__file__).parent.parent / "pipelines" / "trust"
 sys.path.insert(0, str(FOLDER))

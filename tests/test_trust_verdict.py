@@ -9,7 +9,7 @@ from sfm_scenes import simulated_dive
 from uwsfm import DomePort
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene

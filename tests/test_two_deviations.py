@@ -14,15 +14,15 @@ from rich.console import Console
 import uwsfm
 from uwsfm import calibrate
 from uwsfm.calibration.given_errors import given_reach
-from uwsfm.calibration.places import placed
+from uwsfm.calibration.point_placement import placed
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.calibration.scale import scale_slope
+from uwsfm.cli.tables import budget_table, housing_table, result_table
 from uwsfm.errors import InputError
-from uwsfm.export.files import SUMMARY
-from uwsfm.job_checks import require_effect
+from uwsfm.jobs.checks import require_effect
 from uwsfm.report.tables import estimates
 from uwsfm.report.words import deviation
-from uwsfm.result_tables import budget_table, housing_table, result_table
+from uwsfm.results.files import SUMMARY
 
 
 @pytest.fixture(scope="module")

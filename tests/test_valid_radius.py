@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from sfm_scenes import model_of, simulated_dive
 
-from uwsfm.rig import Rig
-from uwsfm.sfm.colmap_model import ImageModel
-from uwsfm.sfm.model_rig import same_frame_matches
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.from_colmap.colmap_model import ImageModel
+from uwsfm.sfm.from_colmap.model_rig import same_frame_matches
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.refine import refine_scene
-from uwsfm.sfm.same_frame import read_same_frame_matches
+from uwsfm.sfm.rig_checks.stereo_matches import read_same_frame_matches
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps

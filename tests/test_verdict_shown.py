@@ -15,15 +15,15 @@ from sfm_scenes import model_of, simulated_dive
 from typer import Exit
 from typer.testing import CliRunner
 
-from uwsfm.batch import Outcome, cause_of
-from uwsfm.cli import app
-from uwsfm.cli_results import NO_FIT, finish
+from uwsfm.cli.app import app
+from uwsfm.cli.results import NO_FIT, finish
+from uwsfm.cli.tables import batch_table
 from uwsfm.errors import InputError
-from uwsfm.export.files import HOUSING, SUMMARY, export_colmap
-from uwsfm.export.verdict_summary import verdict_line, with_verdict
+from uwsfm.jobs.batch import Outcome, cause_of
 from uwsfm.report.gather import PAGE
-from uwsfm.result_tables import batch_table
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.results.files import HOUSING, SUMMARY, export_colmap
+from uwsfm.results.verdict_summary import verdict_line, with_verdict
+from uwsfm.rig.file import dump_rig, load_rig
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.trust.reason import DOUBTFUL, reason
 
@@ -196,7 +196,7 @@ def test_batch_shows_the_named_cause_or_else_the_first_reason():
 
 
 def test_a_pipe_is_wide_enough_and_a_terminal_as_wide_as_it_is():
-    script = "from uwsfm.console import console; print(console.width)"
+    script = "from uwsfm.cli.console import console; print(console.width)"
     for columns, expected in ((None, "200"), ("80", "80")):
         environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"}
         if columns is not None:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hand_made_result import small_model
 
-from uwsfm._checksums import write_checksums
+from uwsfm._base.checksums import write_checksums
 from uwsfm.errors import InputError, MissingPackageError
-from uwsfm.export.files import (
+from uwsfm.geometry import rigid3
+from uwsfm.results.files import (
     HOUSING,
     SUMMARY,
     WORK,
@@ -21,8 +22,7 @@ from uwsfm.export.files import (
     read_summary,
     unit_of_model,
 )
-from uwsfm.export.housing import export_housing
-from uwsfm.geometry import rigid3
+from uwsfm.results.housing import export_housing
 from uwsfm.surface.geotiff import (
     write_color_tiff,
     write_height_tiff,

@@ -7,10 +7,9 @@ import logging
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING
 
-from uwsfm._load_order import refuse_broken_zlib
+from uwsfm._base.load_order import refuse_broken_zlib
 
 if TYPE_CHECKING:
-    from uwsfm.batch import run_batch
     from uwsfm.calibration.bundle_adjustment import calibrate
     from uwsfm.calibration.error_budget import error_budget, with_budget
     from uwsfm.calibration.lengths import Distances, Lengths, Positions
@@ -18,39 +17,40 @@ if TYPE_CHECKING:
     from uwsfm.calibration.perspective import perspective_adjustment
     from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
-    from uwsfm.check_halves import check_halves
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
-    from uwsfm.colmap import Model
+    from uwsfm.colmap.model import Model
     from uwsfm.color.commands import correct_colors
     from uwsfm.dense.run import dense_cloud
     from uwsfm.errors import InputError, UwsfmError
-    from uwsfm.export.files import export_colmap, export_ply, read_model
-    from uwsfm.export.housing import export_housing
     from uwsfm.export.pinhole_files import export_pinhole
     from uwsfm.export.refractive_colmap import export_refractive_colmap
     from uwsfm.export.scene_ply import export_scene_ply
-    from uwsfm.housing_pipeline import calibrate_housing
-    from uwsfm.job_options import (
+    from uwsfm.jobs.batch import run_batch
+    from uwsfm.jobs.calibrate_housing import calibrate_housing
+    from uwsfm.jobs.check_halves import check_halves
+    from uwsfm.jobs.reconstruct import reconstruct
+    from uwsfm.jobs.refine_model import refine_model
+    from uwsfm.measuring.measure import measure
+    from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
+    from uwsfm.models.refractive import RefractiveCamera
+    from uwsfm.models.status import Status
+    from uwsfm.options.jobs import (
         CalibrateHousingOptions,
         ReconstructOptions,
         RefineOptions,
     )
-    from uwsfm.measuring.measure import measure
-    from uwsfm.models.port import DomePort, FlatPort, NoPort
-    from uwsfm.models.refractive import RefractiveCamera
-    from uwsfm.models.status import Status
-    from uwsfm.pipeline import reconstruct
-    from uwsfm.refine_pipeline import refine_model
     from uwsfm.report.files import write_report
-    from uwsfm.result_folder import Result, open_result
-    from uwsfm.rig import Rig
-    from uwsfm.rig_file import load_rig
+    from uwsfm.results.files import export_colmap, export_ply, read_model
+    from uwsfm.results.folder import Result, open_result
+    from uwsfm.results.housing import export_housing
+    from uwsfm.rig.file import load_rig
+    from uwsfm.rig.rig import Rig
     from uwsfm.scene import Scene
-    from uwsfm.sfm.options import MatchOptions, StartOptions
-    from uwsfm.sfm.refractive_colmap import (
+    from uwsfm.sfm.from_colmap.refractive_colmap import (
         read_refractive_colmap,
         rig_of_refractive_colmap,
     )
+    from uwsfm.sfm.options import MatchOptions, StartOptions
     from uwsfm.surface.commands import (
         clean_cloud,
         export_las,
@@ -66,26 +66,26 @@ logger = logging.getLogger("uwsfm")
 logger.addHandler(logging.NullHandler())
 
 _HOMES = {
-    "CalibrateHousingOptions": "uwsfm.job_options",
+    "CalibrateHousingOptions": "uwsfm.options.jobs",
     "CalibrateOptions": "uwsfm.calibration.problem",
     "CalibrationResult": "uwsfm.calibration.problem",
     "Cloud": "uwsfm.cloud",
-    "DomePort": "uwsfm.models.port",
+    "DomePort": "uwsfm.models.ports.port",
     "Distances": "uwsfm.calibration.lengths",
     "Lengths": "uwsfm.calibration.lengths",
     "Positions": "uwsfm.calibration.lengths",
-    "FlatPort": "uwsfm.models.port",
-    "NoPort": "uwsfm.models.port",
-    "Model": "uwsfm.colmap",
-    "Rig": "uwsfm.rig",
+    "FlatPort": "uwsfm.models.ports.port",
+    "NoPort": "uwsfm.models.ports.port",
+    "Model": "uwsfm.colmap.model",
+    "Rig": "uwsfm.rig.rig",
     "InputError": "uwsfm.errors",
     "RefractiveCamera": "uwsfm.models.refractive",
     "Scene": "uwsfm.scene",
     "Status": "uwsfm.models.status",
     "UwsfmError": "uwsfm.errors",
     "calibrate": "uwsfm.calibration.bundle_adjustment",
-    "calibrate_housing": "uwsfm.housing_pipeline",
-    "check_halves": "uwsfm.check_halves",
+    "calibrate_housing": "uwsfm.jobs.calibrate_housing",
+    "check_halves": "uwsfm.jobs.check_halves",
     "clean_cloud": "uwsfm.surface.commands",
     "correct_colors": "uwsfm.color.commands",
     "error_budget": "uwsfm.calibration.error_budget",
@@ -94,30 +94,30 @@ _HOMES = {
     "verdicts": "uwsfm.calibration.observability",
     "with_budget": "uwsfm.calibration.error_budget",
     "dense_cloud": "uwsfm.dense.run",
-    "export_colmap": "uwsfm.export.files",
-    "export_housing": "uwsfm.export.housing",
+    "export_colmap": "uwsfm.results.files",
+    "export_housing": "uwsfm.results.housing",
     "export_las": "uwsfm.surface.commands",
     "export_pinhole": "uwsfm.export.pinhole_files",
-    "export_ply": "uwsfm.export.files",
+    "export_ply": "uwsfm.results.files",
     "export_refractive_colmap": "uwsfm.export.refractive_colmap",
     "export_scene_ply": "uwsfm.export.scene_ply",
-    "load_rig": "uwsfm.rig_file",
+    "load_rig": "uwsfm.rig.file",
     "make_map": "uwsfm.surface.commands",
     "mesh_cloud": "uwsfm.surface.commands",
     "measure": "uwsfm.measuring.measure",
     "read_cloud": "uwsfm.cloud",
-    "read_model": "uwsfm.export.files",
-    "read_refractive_colmap": "uwsfm.sfm.refractive_colmap",
-    "rig_of_refractive_colmap": "uwsfm.sfm.refractive_colmap",
-    "Result": "uwsfm.result_folder",
-    "open_result": "uwsfm.result_folder",
+    "read_model": "uwsfm.results.files",
+    "read_refractive_colmap": "uwsfm.sfm.from_colmap.refractive_colmap",
+    "rig_of_refractive_colmap": "uwsfm.sfm.from_colmap.refractive_colmap",
+    "Result": "uwsfm.results.folder",
+    "open_result": "uwsfm.results.folder",
     "MatchOptions": "uwsfm.sfm.options",
     "StartOptions": "uwsfm.sfm.options",
-    "ReconstructOptions": "uwsfm.job_options",
-    "RefineOptions": "uwsfm.job_options",
-    "reconstruct": "uwsfm.pipeline",
-    "refine_model": "uwsfm.refine_pipeline",
-    "run_batch": "uwsfm.batch",
+    "ReconstructOptions": "uwsfm.options.jobs",
+    "RefineOptions": "uwsfm.options.jobs",
+    "reconstruct": "uwsfm.jobs.reconstruct",
+    "refine_model": "uwsfm.jobs.refine_model",
+    "run_batch": "uwsfm.jobs.batch",
     "write_report": "uwsfm.report.files",
     "Verdict": "uwsfm.trust.verdict",
     "judge": "uwsfm.trust.verdict",

@@ -1,6 +1,6 @@
 """`python -m uwsfm`: the command line where its script is not on the path."""
 
-from uwsfm.cli import main
+from uwsfm.cli.app import main
 
 if __name__ == "__main__":
     main()

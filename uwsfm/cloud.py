@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwsfm._ply import read_vertices, write_ply
+from uwsfm._base.ply import read_vertices, write_ply
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwsfm._indices import renumbered
+from uwsfm._base.indices import renumbered
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import Port
+from uwsfm.models.ports.port import Port
 from uwsfm.models.refractive import RefractiveCamera
 
 IndexArray = NDArray[np.int64]

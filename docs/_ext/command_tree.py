@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from uwsfm.cli import app
+from uwsfm.cli.app import app
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,10 +21,12 @@ from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
 
 import uwsfm
-from uwsfm import dives_file, lengths_file, rig_schema
 from uwsfm.calibration import given_accuracy
+from uwsfm.inputs import lengths_file
+from uwsfm.jobs import dives_file
 from uwsfm.measuring import measurements_file
-from uwsfm.rig_values import ACCURACIES
+from uwsfm.rig import schema as rig_schema
+from uwsfm.rig.values import ACCURACIES
 
 PAGES_OF_API = {
     "Run a whole job": "reconstruct refine_model calibrate_housing run_batch "

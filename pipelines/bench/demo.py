@@ -10,10 +10,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-COMPILE = "from uwsfm.first_run import compile_kernels; print(compile_kernels(2))"
+COMPILE = (
+    "from uwsfm.jobs.compile_kernels import compile_kernels; print(compile_kernels(2))"
+)
 SOURCE = str(Path(__file__).resolve().parents[2])
-IMPORT = "import uwsfm.cli, uwsfm.pipeline"
-ENTRY = "from uwsfm.cli import main; main()"
+IMPORT = "import uwsfm.cli.app, uwsfm.jobs.reconstruct"
+ENTRY = "from uwsfm.cli.app import main; main()"
 LAST_STAGES = ("refractive adjustment", "colours and export", "report")
 """Which every run does again; the ones before are kept between runs."""
 

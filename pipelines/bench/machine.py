@@ -9,7 +9,7 @@ from typing import Any
 
 import psutil
 
-from uwsfm.export.summary import versions
+from uwsfm.results.summary import versions
 
 
 def description() -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from uwsfm.geometry.rigid3 import Array, rotmat_from_quat
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.scene import Scene
 
 MAX_STEPS = 50

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from solver import Solve, cpu_per_observation
 from threadpoolctl import threadpool_limits
 
-from uwsfm.colmap import to_reconstruction
+from uwsfm.colmap.model import to_reconstruction
 from uwsfm.export.refractive_colmap import export_refractive_colmap
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene

@@ -24,7 +24,7 @@ import report
 from child import call
 from targets import outcomes
 
-from uwsfm.export.summary import write_json
+from uwsfm.results.summary import write_json
 
 SIZES = (20, 100, 500, 2000, 5000)
 SMALL_SIZES = (12, 20)

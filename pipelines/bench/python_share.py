@@ -93,9 +93,10 @@ def measure(num_frames: int) -> dict[str, Any]:
             if kind in ("instancemethod", "staticmethod") and own:
                 clock.watch(thing, method, "pycolmap")
 
-    from uwsfm import _jit, reconstruct
-    from uwsfm.demo import sample_dir
-    from uwsfm.first_run import compile_kernels
+    from uwsfm import reconstruct
+    from uwsfm._base import jit as _jit
+    from uwsfm.jobs.compile_kernels import compile_kernels
+    from uwsfm.jobs.demo import sample_dir
 
     enter = _jit._Dispatcher.__call__
     _jit._Dispatcher.__call__ = clock.timed("kernels", enter)  # type: ignore

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._base.jit import kernel
 from uwsfm.models.projection import JAC_SIZE, project, project_with_jac, unproject
 from uwsfm.models.status import VALID
 from uwsfm.residuals.border import BORDER_SIZE

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.scene import Scene
-from uwsfm.solver import levenberg_marquardt, schur
+from uwsfm.solver import levenberg_marquardt
 from uwsfm.solver.layout import build_layout
 from uwsfm.solver.levenberg_marquardt import (
     LevenbergMarquardtOptions,
@@ -24,6 +24,7 @@ from uwsfm.solver.levenberg_marquardt import (
     Report,
     minimize,
 )
+from uwsfm.solver.linear import schur
 from uwsfm.solver.state import State
 from uwsfm.solver.threads import limited
 

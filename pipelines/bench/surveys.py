@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm._files import replaced_file
-from uwsfm.colmap import Model
-from uwsfm.models.port import NoPort
+from uwsfm._base.files import replaced_file
+from uwsfm.colmap.model import Model
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.simulate.perturbations import Perturbation, perturbed
 from uwsfm.simulate.rigs import paper_rig

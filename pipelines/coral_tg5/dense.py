@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 import uwsfm
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 
 VIEWS = ("P5030263", "P5030299", "P5030341")

@@ -17,9 +17,9 @@ import pycolmap
 import yaml
 
 import uwsfm
-from uwsfm.console import ProgressBars, console
-from uwsfm.pipeline import WORK
-from uwsfm.result_tables import housing_table, result_table
+from uwsfm.cli.console import ProgressBars, console
+from uwsfm.cli.tables import housing_table, result_table
+from uwsfm.jobs.reconstruct import WORK
 
 FOCAL_PX = 867.0
 """25 mm, reduced to 35 mm film, on 1200 x 900 pixels."""

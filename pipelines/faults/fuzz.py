@@ -120,17 +120,17 @@ def _text_kind(name: str, text: str, read: Callable[[Path], object]) -> Kind:
 
 
 def _rig(path: Path) -> object:
-    from uwsfm.rig_file import load_rig
+    from uwsfm.rig.file import load_rig
 
     rig = load_rig(path)
     return rig.refractive_cameras(), rig.given_accuracy()
 
 
 def _kinds(names: list[str] | None = None) -> dict[str, Callable[[], Kind]]:
-    from uwsfm.covariance_file import read_covariance
-    from uwsfm.dives_file import load_dives
-    from uwsfm.lengths_file import load_lengths, load_positions
+    from uwsfm.inputs.lengths_file import load_lengths, load_positions
+    from uwsfm.jobs.dives_file import load_dives
     from uwsfm.measuring.measurements_file import load_measurements
+    from uwsfm.rig.covariance_file import read_covariance
 
     matrix = {"names": ["left.focal"], "matrix": [[1.0]]}
     return {
@@ -196,7 +196,7 @@ def _small_model(folder: Path, *, binary: bool) -> None:
 
 
 def _model(*, binary: bool) -> Kind:
-    from uwsfm.colmap import read_reconstruction
+    from uwsfm.colmap.model import read_reconstruction
 
     def read(folder: Path) -> object:
         images = read_reconstruction(folder).images.values()
@@ -209,7 +209,7 @@ def _model(*, binary: bool) -> Kind:
 
 
 def _ports() -> Kind:
-    from uwsfm.sfm.refractive_colmap import rig_of_refractive_colmap
+    from uwsfm.sfm.from_colmap.refractive_colmap import rig_of_refractive_colmap
 
     with tempfile.TemporaryDirectory() as name:
         _small_model(Path(name), binary=False)
@@ -241,7 +241,7 @@ def _images() -> Kind:
     import cv2
 
     from uwsfm.errors import InputError
-    from uwsfm.sfm.pixels import image_fault
+    from uwsfm.sfm.frontend.pixels import image_fault
 
     pixels = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
     files = {

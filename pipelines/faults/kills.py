@@ -99,7 +99,7 @@ def write_inputs(folder: Path) -> None:
     (folder / "out").rename(folder / "finished")
 
 
-UWSFM = [sys.executable, "-c", "from uwsfm.cli import main; main()"]
+UWSFM = [sys.executable, "-c", "from uwsfm.cli.app import main; main()"]
 
 
 def started(job: Job, folder: Path) -> subprocess.Popen[bytes]:

@@ -60,17 +60,22 @@ _PIPE = (
 
 GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
     "console": {
-        "console.py": (*_TABLES, "test_progress_display.py", "test_signals.py", _PIPE),
-        "result_tables.py": _TABLES,
-        "evaluate.py": ("test_comparison.py",),
+        "cli/console.py": (
+            *_TABLES,
+            "test_progress_display.py",
+            "test_signals.py",
+            _PIPE,
+        ),
+        "cli/tables.py": _TABLES,
+        "jobs/evaluate.py": ("test_comparison.py",),
     },
     "summary": {
-        "export/summary.py": (*_SUMMARY, "test_images_counted.py"),
-        "export/verdict_summary.py": _SUMMARY,
-        "export/halves_summary.py": _SUMMARY,
+        "results/summary.py": (*_SUMMARY, "test_images_counted.py"),
+        "results/verdict_summary.py": _SUMMARY,
+        "results/halves_summary.py": _SUMMARY,
         "calibration/tilt.py": ("test_tilt.py",),
-        "export/housing.py": ("test_housing_comments.py",),
-        "export/files.py": ("test_written_units.py",),
+        "results/housing.py": ("test_housing_comments.py",),
+        "results/files.py": ("test_written_units.py",),
         "surface/units.py": ("test_written_units.py",),
         "surface/geotiff.py": ("test_written_units.py",),
     },
@@ -96,8 +101,8 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "measuring/measurements_file.py": ("test_measure_picks.py",),
     },
     "known lengths": {
-        "known_lengths.py": _LENGTHS,
-        "lengths_file.py": _LENGTHS,
+        "inputs/known_lengths.py": _LENGTHS,
+        "inputs/lengths_file.py": _LENGTHS,
         "calibration/lengths.py": _LENGTHS,
         "calibration/length_verdicts.py": _LENGTHS,
     },

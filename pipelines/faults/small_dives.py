@@ -13,10 +13,10 @@ import numpy as np
 import pycolmap
 import yaml
 
-from uwsfm._partial import PARTIAL
-from uwsfm.demo import sample_dir
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm._base.partial import PARTIAL
+from uwsfm.jobs.demo import sample_dir
+from uwsfm.rig.file import dump_rig, load_rig
+from uwsfm.rig.rig import Rig
 
 SCALE = 0.5
 RIG, IMAGES, DIVES = "rig.yaml", "images", "dives.yaml"

@@ -28,14 +28,14 @@ from reef import floor_of, reef_spec
 from scipy.spatial import cKDTree
 
 import uwsfm
-from uwsfm._packages import import_package
-from uwsfm.colmap import Model
-from uwsfm.console import ProgressBars
+from uwsfm._base.packages import import_package
+from uwsfm.cli.console import ProgressBars
+from uwsfm.colmap.model import Model
 from uwsfm.dense.depth_map import pixel_rows
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import Similarity, align
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.rig.file import dump_rig, load_rig
 from uwsfm.simulate.rigs import known_cam_from_rig
 from uwsfm.simulate.sequence import (
     SequenceSpec,

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import uwsfm
-from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3
+from uwsfm.jobs.demo import sample_dir
 from uwsfm.measuring.measure import MeasureResult
-from uwsfm.result_folder import Result
+from uwsfm.results.folder import Result
 
 SQUARE_M = 0.0254
 STEPS = (1, 2, 3, 5)

@@ -17,7 +17,7 @@ from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.dense.depth_map import pixel_rows, sampled
 from uwsfm.dense.match import match_tiles, num_disparities, refine
 from uwsfm.geometry import rigid3
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
 

@@ -20,7 +20,7 @@ from pinhole import RectifiedPinholes, aligned, best_pinholes
 from reef import Truth, reef_spec, scores
 
 import uwsfm
-from uwsfm.console import ProgressBars
+from uwsfm.cli.console import ProgressBars
 from uwsfm.dense.maps import depth_maps
 from uwsfm.simulate.sequence import SequenceSpec, near_spec, render_sequence
 

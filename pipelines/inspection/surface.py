@@ -18,11 +18,11 @@ import numpy as np
 import tifffile
 
 import uwsfm
-from uwsfm._packages import import_package
+from uwsfm._base.packages import import_package
 from uwsfm.color.commands import correct_colors
 from uwsfm.color.encoding import light_of, values_of
-from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3
+from uwsfm.jobs.demo import sample_dir
 from uwsfm.simulate.rendering import SensorOptions, render_image
 from uwsfm.simulate.rigs import known_cam_from_rig
 from uwsfm.simulate.sequence import floor_in_view, sample_spec

@@ -10,10 +10,10 @@ from monte_carlo import run_all, warm_up
 from tables import Row, column, select
 
 import uwsfm
+from uwsfm._base.tasks import Workers
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.geometry.unit_vector import plus
 from uwsfm.scene import Scene
-from uwsfm.tasks import Workers
 
 ANGLES_DEG = (5.0, 10.0, 20.0)
 DISTANCE_SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)

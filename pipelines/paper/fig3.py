@@ -10,7 +10,7 @@ from settings import Settings
 from tables import Row, Tables, column
 
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.simulate.rigs import tilted_normal
 

@@ -22,6 +22,7 @@ from monte_carlo import (
 from tables import Row, column, select
 
 import uwsfm
+from uwsfm._base.tasks import Workers
 from uwsfm.calibration.perspective import perspective_adjustment
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.uncertainty import predict_covariance
@@ -38,7 +39,6 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion
-from uwsfm.tasks import Workers
 
 NOISES_PX = (0.0, 0.1, 0.25, 0.5, 1.0)
 NUM_FRAMES = 15

@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import uwsfm
-from uwsfm._signals import BEGINS_AGAIN
+from uwsfm._base.signals import BEGINS_AGAIN
+from uwsfm._base.tasks import Workers
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.console import ProgressBars
+from uwsfm.cli.console import ProgressBars
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between, tangent_basis
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.residuals.border import DISTANCE, NORMAL
 from uwsfm.scene import Scene
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import rich_motion
-from uwsfm.tasks import Workers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -16,11 +16,11 @@ from single_pair import HELD
 from tables import Row, Tables, column, markdown, select
 
 import uwsfm
-from uwsfm.models.port import FlatPort
-from uwsfm.pipeline import WORK
-from uwsfm.rig import Rig
-from uwsfm.sfm.images import Frames, find_frames
-from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
+from uwsfm.jobs.reconstruct import WORK
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.images import Frames, find_frames
+from uwsfm.sfm.rig_checks.stereo_scene import same_frame_scene, without_wrong_matches
 from uwsfm.trust.halves import adjusted_alone
 
 TABLES = ("partitions", "whole_tank")

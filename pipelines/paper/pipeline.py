@@ -22,8 +22,8 @@ import targets
 from settings import Settings
 from tables import Tables, read_csv, write_csv
 
-from uwsfm._files import replaced_file
-from uwsfm.tasks import LOCAL, Workers
+from uwsfm._base.files import replaced_file
+from uwsfm._base.tasks import LOCAL, Workers
 
 FIGURES = {
     "fig3": fig3,

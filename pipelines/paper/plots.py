@@ -10,7 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from PIL import Image
 
-from uwsfm._files import replaced_file
+from uwsfm._base.files import replaced_file
 
 BLUE, ORANGE, TEAL, VIOLET, GRAY = "#1c7ed6", "#d9480f", "#0c8599", "#7048e8", "#868e96"
 COLORS = {

@@ -11,19 +11,19 @@ from single_pair import DISTANCES_MM, ERRORS, HELD
 from tables import Row, column, select
 
 import uwsfm
-from uwsfm._progress import Progress
-from uwsfm.console import ProgressBars
+from uwsfm._base.progress import Progress
+from uwsfm._base.tasks import Workers
+from uwsfm.cli.console import ProgressBars
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.scene import Scene
-from uwsfm.sfm.features import extract_features
-from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.matching import match_features
+from uwsfm.sfm.frontend.features import extract_features
+from uwsfm.sfm.frontend.images import find_frames
+from uwsfm.sfm.frontend.matching import match_features
 from uwsfm.sfm.options import FeatureOptions, MatchOptions
-from uwsfm.sfm.same_frame_scene import same_frame_scene
+from uwsfm.sfm.rig_checks.stereo_scene import same_frame_scene
 from uwsfm.simulate.rigs import nominal_rig, paper_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence
 from uwsfm.simulate.trajectories import rich_motion
-from uwsfm.tasks import Workers
 
 NUM_PAIRS = 8
 

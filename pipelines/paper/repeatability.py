@@ -11,13 +11,13 @@ from single_pair import HELD
 from tables import Row, column, select
 
 import uwsfm
-from uwsfm.console import ProgressBars
+from uwsfm.cli.console import ProgressBars
 from uwsfm.errors import UwsfmError
-from uwsfm.models.port import FlatPort
-from uwsfm.pipeline import WORK, ReconstructResult
-from uwsfm.rig import Rig
-from uwsfm.sfm.images import find_frames
-from uwsfm.sfm.same_frame_scene import same_frame_scene, without_wrong_matches
+from uwsfm.jobs.reconstruct import WORK, ReconstructResult
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.images import find_frames
+from uwsfm.sfm.rig_checks.stereo_scene import same_frame_scene, without_wrong_matches
 from uwsfm.simulate.rigs import nominal_rig, sample_rig
 from uwsfm.simulate.sequence import SequenceSpec, render_sequence, reseeded
 from uwsfm.simulate.trajectories import rich_motion

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from uwsfm.tasks import Workers
+from uwsfm._base.tasks import Workers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from monte_carlo import (
 from tables import Row, column, select
 
 import uwsfm
+from uwsfm._base.tasks import Workers
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.simulate import (
     ObservationOptions,
@@ -30,7 +31,6 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import paper_rig
 from uwsfm.simulate.trajectories import level_poses
-from uwsfm.tasks import Workers
 
 ERRORS = ("reprojection", "virtual_camera", "virtual_camera_tangential")
 """The error in space says nothing of one pair: for any ports, a point that is where its

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from uwsfm._files import replaced_file
+from uwsfm._base.files import replaced_file
 
 Row = dict[str, Any]
 """One line of a table: column name with its unit -> number or text."""

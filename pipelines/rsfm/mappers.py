@@ -17,11 +17,11 @@ import pycolmap
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
-from uwsfm.pipeline import start_scene
-from uwsfm.rig import Rig
+from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.options import Mapper, StartOptions
-from uwsfm.sfm.perspective import StartArrays
+from uwsfm.sfm.pinhole.perspective import StartArrays
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches

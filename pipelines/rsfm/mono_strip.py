@@ -23,11 +23,11 @@ from strips import OVERLAP
 import uwsfm
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
-from uwsfm.pipeline import start_scene
-from uwsfm.rig import Rig
-from uwsfm.sfm.background import opened
+from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.background import opened
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.perspective import StartArrays
+from uwsfm.sfm.pinhole.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.sfm.start import start_from_matches

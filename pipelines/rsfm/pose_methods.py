@@ -12,13 +12,13 @@ from pose_trials import FOCAL_PX, N_WATER, SIZE, AbsoluteTrial, RelativeTrial
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.sfm.absolute_pose import checked, estimate_rig_pose
-from uwsfm.sfm.kernel_rows import near_rays, rig_rows
-from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
-from uwsfm.sfm.relative_pose import RelativePoseOptions, estimate_relative_pose
+from uwsfm.sfm.poses.absolute_pose import checked, estimate_rig_pose
+from uwsfm.sfm.poses.kernel_rows import near_rays, rig_rows
+from uwsfm.sfm.poses.relative_pose import RelativePoseOptions, estimate_relative_pose
+from uwsfm.sfm.poses.relative_pose_kernel import pair_equations
+from uwsfm.sfm.poses.rig_pose_kernel import covariance_from_hessian, normal_equations
+from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
 from uwsfm.solver.losses import LOSS_CODES
-from uwsfm.solver.rig_pair import pair_equations
-from uwsfm.solver.rig_pose import covariance_from_hessian, normal_equations
 
 NUM_DRAWS = 20
 MAX_ERROR_PX = 12.0

@@ -30,10 +30,10 @@ from pose_methods import (  # noqa: E402
 from pose_trials import PORTS, absolute_trial, relative_trial  # noqa: E402
 from tables import Row, markdown, read_csv, write_csv  # noqa: E402
 
-from uwsfm._files import replaced_file  # noqa: E402
-from uwsfm._signals import BEGINS_AGAIN  # noqa: E402
-from uwsfm.console import ProgressBars  # noqa: E402
-from uwsfm.tasks import LOCAL, Workers  # noqa: E402
+from uwsfm._base.files import replaced_file  # noqa: E402
+from uwsfm._base.signals import BEGINS_AGAIN  # noqa: E402
+from uwsfm._base.tasks import LOCAL, Workers  # noqa: E402
+from uwsfm.cli.console import ProgressBars  # noqa: E402
 
 ABSOLUTE_CSV, RELATIVE_CSV = "absolute_pose.csv", "relative_pose.csv"
 NOISES_PX = (0.0, 0.5, 1.2, 2.0)

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 import uwsfm
-from uwsfm._signals import BEGINS_AGAIN
-from uwsfm.console import ProgressBars
+from uwsfm._base.signals import BEGINS_AGAIN
+from uwsfm._base.tasks import LOCAL, Workers
+from uwsfm.cli.console import ProgressBars
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows, triangulate_tracks
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate import (
     ObservationOptions,
     Relief,
@@ -36,7 +37,6 @@ from uwsfm.simulate import (
 )
 from uwsfm.simulate.rigs import known_cam_from_rig, nominal_rig, paper_rig
 from uwsfm.simulate.trajectories import rich_motion, straight_strip
-from uwsfm.tasks import LOCAL, Workers
 
 sys.path.append(str(Path(__file__).parent.parent / "paper"))
 

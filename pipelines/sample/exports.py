@@ -16,11 +16,11 @@ import matplotlib
 import numpy as np
 
 import uwsfm
-from uwsfm.demo import sample_dir
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.export.pinhole import PinholeModel, pinhole_model, virtual_from_img
 from uwsfm.export.warp import read_image, warp_image, warp_maps
 from uwsfm.geometry import rigid3
+from uwsfm.jobs.demo import sample_dir
 from uwsfm.simulate.sequence import floor_in_view, sample_spec
 
 matplotlib.use("Agg")

@@ -16,8 +16,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import uwsfm
-from uwsfm.demo import sample_dir
 from uwsfm.geometry import rigid3
+from uwsfm.jobs.demo import sample_dir
 
 
 def camera_frusta(model: uwsfm.Model, depth: float = 0.12) -> list[np.ndarray]:

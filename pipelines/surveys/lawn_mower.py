@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 from comparison import RESULT, RUNS, compared, page
 
-from uwsfm._files import replaced_file
-from uwsfm.pipeline import start_scene
-from uwsfm.rig import Rig
+from uwsfm._base.files import replaced_file
+from uwsfm._base.tasks import LOCAL
+from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.rig.rig import Rig
 from uwsfm.sfm.options import MappingOptions, StartOptions
 from uwsfm.sfm.refine import refine_scene
 from uwsfm.sfm.simulated import frames_of, write_features
@@ -30,7 +31,6 @@ from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps
 from uwsfm.simulate.rigs import nominal_rig, paper_rig
 from uwsfm.simulate.surveys import SurveySpec, simulate_survey, survey_track
-from uwsfm.tasks import LOCAL
 
 DATABASE = "database.db"
 WRONG = 0.1

@@ -29,8 +29,8 @@ import yaml
 from right_observations import Observations, right_ones
 
 import uwsfm
-from uwsfm._files import replaced_file
-from uwsfm.colmap import Model
+from uwsfm._base.files import replaced_file
+from uwsfm.colmap.model import Model
 from uwsfm.errors import UwsfmError
 from uwsfm.simulate.commands import simulate_images
 from uwsfm.simulate.sequence import PRESETS

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from uwsfm.calibration.error_budget import with_budget
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.sfm.refine import Refined
 from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.verdict import judged, used_of

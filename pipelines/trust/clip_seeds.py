@@ -24,10 +24,10 @@ import pycolmap
 from against_colmap import CLIP_OPTIONS, stock_model
 
 import uwsfm
-from uwsfm._files import replaced_file
+from uwsfm._base.files import replaced_file
 from uwsfm.errors import UwsfmError
-from uwsfm.models.port import FlatPort
-from uwsfm.output_folder import WORK
+from uwsfm.jobs.output_folder import WORK
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.scene import Scene
 
 NUM_SEEDS = 10

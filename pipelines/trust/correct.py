@@ -20,12 +20,12 @@ import pycolmap
 from dives import WRONG_MATCHES, Dive, dive_of, points_of
 from outcomes import FITS, LIMIT, outcome_of
 
-from uwsfm._files import replaced_file
-from uwsfm.console import ProgressBars
+from uwsfm._base.files import replaced_file
+from uwsfm.cli.console import ProgressBars
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, Port
-from uwsfm.rig import Rig, RigCamera, camera_from_colmap
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.sfm.simulated import write_features
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import rough_port, tilted_normal

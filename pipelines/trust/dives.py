@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort
-from uwsfm.rig import Rig
+from uwsfm.models.ports.port import DomePort
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.images import Frames
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.simulated import frames_of, write_features
 from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
 from uwsfm.simulate.rigs import nominal_rig, stereo_rig

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from dives import Dive, read_dive
 
-from uwsfm.rig_file import load_rig
-from uwsfm.sfm.images import find_frames
+from uwsfm.rig.file import load_rig
+from uwsfm.sfm.frontend.images import find_frames
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.start import match_images
 from uwsfm.sfm.steps import Steps

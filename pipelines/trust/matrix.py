@@ -20,8 +20,8 @@ from images import rendered_dive
 from outcomes import FITS, REFUSED, Outcome, causes_of, outcome_of
 from wrong_inputs import MISTAKES, Mistake
 
-from uwsfm._files import replaced_file
-from uwsfm.console import ProgressBars
+from uwsfm._base.files import replaced_file
+from uwsfm.cli.console import ProgressBars
 from uwsfm.errors import InputError
 
 TRIALS = 3

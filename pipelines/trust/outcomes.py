@@ -18,19 +18,19 @@ from scipy.spatial.distance import pdist
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.propagation import Propagation
 from uwsfm.errors import ExplainedInputError, UwsfmError
-from uwsfm.export.summary import housing_summary, scale_summary
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between
-from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
-from uwsfm.pipeline import refined_rig, start_scene
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig, load_rig
+from uwsfm.jobs.reconstruct import refined_rig, start_scene
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.results.summary import housing_summary, scale_summary
+from uwsfm.rig.file import dump_rig, load_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.fixed_rig import fix_rig
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.refine import Refined, refine_scene
+from uwsfm.sfm.rig_checks.fixed_rig import fix_rig
 from uwsfm.sfm.scene_points import retriangulated
 from uwsfm.sfm.start import start_from_matches
 from uwsfm.sfm.steps import Steps

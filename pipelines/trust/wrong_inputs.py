@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, NoPort
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.rig import Rig, RigCamera, camera_from_colmap
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.simulate.rigs import known_cam_from_rig
 
 BOTH, LEFT, RIGHT = (0, 1), (0,), (1,)

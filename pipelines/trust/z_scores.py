@@ -25,7 +25,7 @@ import numpy as np
 
 import uwsfm
 from uwsfm.calibration.problem import CalibrationResult
-from uwsfm.console import ProgressBars
+from uwsfm.cli.console import ProgressBars
 from uwsfm.scene import IndexArray
 from uwsfm.trust.halves import adjusted_alone
 from uwsfm.trust.shared_numbers import SharedNumber, shared_numbers

@@ -16,8 +16,8 @@ from budget import budget_table, recalibration
 from tank_rig import write_rig
 
 import uwsfm
-from uwsfm.console import ProgressBars
-from uwsfm.pipeline import WORK
+from uwsfm.cli.console import ProgressBars
+from uwsfm.jobs.reconstruct import WORK
 
 
 def run_refractive(data: Path, out: Path, **how: bool):

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 
 # One thread: with more, the same seed gives another model each time.
 NUM_THREADS = 1

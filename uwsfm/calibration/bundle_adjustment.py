@@ -11,20 +11,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.problem import (
     CalibrateOptions,
     CalibrateSummary,
     CalibrationResult,
 )
-from uwsfm.calibration.run import MIN_SIGMA_PX, Run, Solved
 from uwsfm.calibration.scaling import moved
+from uwsfm.calibration.solves import MIN_SIGMA_PX, Run, Solved
 from uwsfm.calibration.uncertainty import posterior_covariance
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.models.port import FlatPort, NoPort
+from uwsfm.models.ports.port import FlatPort, NoPort
 from uwsfm.scene import Scene
 from uwsfm.solver.levenberg_marquardt import Report, Stop
 

@@ -17,7 +17,7 @@ from uwsfm.calibration.problem import (
     InAll,
 )
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 

@@ -19,7 +19,7 @@ from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS
-from uwsfm.models.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 

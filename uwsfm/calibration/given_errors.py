@@ -23,7 +23,7 @@ from uwsfm.calibration.problem import (
     CameraCovariance,
     InAll,
 )
-from uwsfm.calibration.reopened import reopened
+from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.calibration.uncertainty import (
     Optimum,
@@ -33,17 +33,17 @@ from uwsfm.calibration.uncertainty import (
 )
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.port import DomePort, NoPort
+from uwsfm.models.ports.port import DomePort, NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.solver import schur
 from uwsfm.solver.layout import HELD, Layout, with_columns
 from uwsfm.solver.levenberg_marquardt import suitable_blas
+from uwsfm.solver.linear import schur
+from uwsfm.solver.linear.quasidefinite import symmetric
+from uwsfm.solver.linear.reduced_factor import coupling_columns, inverse
+from uwsfm.solver.linear.reduction import analyse
 from uwsfm.solver.normal_equations import NormalEquations
-from uwsfm.solver.quasidefinite import symmetric
-from uwsfm.solver.reduced_factor import coupling_columns, inverse
-from uwsfm.solver.reduction import analyse
 
 
 def camera_as_given(

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from uwsfm.calibration.given_errors import GivenReach
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
 from uwsfm.residuals import border
 
 _LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

@@ -17,7 +17,7 @@ from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD

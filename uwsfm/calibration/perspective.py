@@ -13,7 +13,7 @@ import numpy as np
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import CalibrateSummary
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DOME, FLAT, KIND
+from uwsfm.models.ports.port import DOME, FLAT, KIND
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout

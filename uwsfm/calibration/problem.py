@@ -13,7 +13,7 @@ from uwsfm.calibration.lengths import LengthFit, Lengths, PositionFit
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene

@@ -33,8 +33,8 @@ from uwsfm.solver.clustered import cluster_scores, given_back
 from uwsfm.solver.covariance import reduced_covariance
 from uwsfm.solver.layout import HELD, Layout, build_layout, with_columns
 from uwsfm.solver.levenberg_marquardt import suitable_blas
+from uwsfm.solver.linear.reduction import analyse
 from uwsfm.solver.normal_equations import NormalEquations
-from uwsfm.solver.reduction import analyse
 from uwsfm.solver.terms import skew_matrices
 
 FEATURE = -1
@@ -121,7 +121,8 @@ class Propagation:
         )
 
     def of_rays(self, seen: Scene, stddevs_px: Array) -> Places:
-        """Places that rays of the model set, as `uwsfm.calibration.places.placed`.
+        """Places that rays of the model set, as
+        `uwsfm.calibration.point_placement.placed`.
 
         Args:
             seen: M points and their observations, in frames of the model.

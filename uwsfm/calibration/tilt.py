@@ -12,7 +12,7 @@ import numpy as np
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 

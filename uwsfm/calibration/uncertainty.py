@@ -6,16 +6,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._indices import distinct, renumbered
+from uwsfm._base.indices import distinct, renumbered
+from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
 from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DOME, KIND, DomePort
+from uwsfm.models.ports.port import DOME, KIND, DomePort
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.clustered import cluster_scores, clustered_covariance
@@ -32,8 +32,8 @@ from uwsfm.solver.levenberg_marquardt import (
     Problem,
     suitable_blas,
 )
+from uwsfm.solver.linear.reduction import Reduction, analyse
 from uwsfm.solver.normal_equations import NormalEquations, empty_normal_equations
-from uwsfm.solver.reduction import Reduction, analyse
 from uwsfm.solver.state import State, translation_arm
 from uwsfm.solver.terms import centers
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._files import checked_target, replaced_dir
-from uwsfm._ply import read_vertices, write_ply
-from uwsfm._progress import Progress, silent
+from uwsfm._base.files import checked_target, replaced_dir
+from uwsfm._base.ply import read_vertices, write_ply
+from uwsfm._base.progress import Progress, silent
 from uwsfm.color.apply import (
     Correction,
     corrected_colors,
@@ -22,10 +22,10 @@ from uwsfm.color.exposure import exposure_warnings
 from uwsfm.color.samples import Samples, sample_scene
 from uwsfm.color.water_fit import fit_water
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.export.files import POINTS
-from uwsfm.export.summary import write_json
 from uwsfm.export.warp import read_image, write_image
-from uwsfm.result_folder import WATER, Result, find_dense_cloud, open_result
+from uwsfm.results.files import POINTS
+from uwsfm.results.folder import WATER, Result, find_dense_cloud, open_result
+from uwsfm.results.summary import write_json
 
 STATED = "colours without the water, by uwsfm color"
 

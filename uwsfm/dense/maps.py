@@ -26,9 +26,9 @@ from uwsfm.dense.views import (
     stereo_views,
 )
 from uwsfm.errors import InputError
-from uwsfm.export.files import WORK
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.result_folder import Result, open_result
+from uwsfm.results.files import WORK
+from uwsfm.results.folder import Result, open_result
 
 FOLDER = "dense"
 """In the workspace."""

@@ -6,8 +6,8 @@ import math
 import re
 from dataclasses import dataclass
 
+from uwsfm._base.tasks import require_threads
 from uwsfm.errors import InputError
-from uwsfm.tasks import require_threads
 
 ASSUMED_NOISE_PX = 0.3
 """Of a disparity, where too few depth maps overlap to tell."""

@@ -19,7 +19,7 @@ the pixel's water ray, and how it grows per pixel. Neighbours are one tuple ``se
 
 import numpy as np
 
-from uwsfm._jit import inner_fused, lane
+from uwsfm._base.jit import inner_fused, lane
 from uwsfm.dense.warp import depth_there, warped
 
 RADIUS, STRIDE = 4, 2

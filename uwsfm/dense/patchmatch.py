@@ -9,7 +9,7 @@ Tao, CVPR 2019). Chance is a function of pixel, round and seed: runs repeat exac
 
 import numpy as np
 
-from uwsfm._jit import inner, kernel
+from uwsfm._base.jit import inner, kernel
 from uwsfm.dense.patch import WORST, affine, take_patch, view_cost
 
 NUM_CHOSEN = 3

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.dense.depth_map import DepthMap, read_planes, write_planes
 from uwsfm.dense.patchmatch_depth import (
     Hypotheses,

@@ -21,7 +21,7 @@ from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.sfm.pinhole_fit import MAX_SLOPE, fit_virtual_pinhole
+from uwsfm.sfm.rig_checks.pinhole_fit import MAX_SLOPE, fit_virtual_pinhole
 
 MAX_DEVIATION_PX = 0.5
 """Of rows: beyond it the depth range is split."""

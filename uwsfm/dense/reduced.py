@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.dense.views import load_image
 from uwsfm.models.refractive import RefractiveCamera
 

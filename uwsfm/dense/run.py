@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._disk import explained, require_room
-from uwsfm._files import require_writable
-from uwsfm._partial import remove_stale
-from uwsfm._progress import Progress, silent
+from uwsfm._base.disk import explained, require_room
+from uwsfm._base.files import require_writable
+from uwsfm._base.partial import remove_stale
+from uwsfm._base.progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.exposure import balancing_gains
 from uwsfm.dense.fuse import FuseCounts, Placed, Rule, fuse, noise_px, robust_stddev
@@ -30,10 +30,10 @@ from uwsfm.dense.plan import FUSE_PIXELS, PLACED_BYTES, Load, Plan, plan
 from uwsfm.dense.views import neighbours
 from uwsfm.dense.voxels import Fused, Voxels
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.export.summary import write_json
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.job_log import job_log
-from uwsfm.result_folder import DENSE_CLOUD, Result, open_result
+from uwsfm.results.folder import DENSE_CLOUD, Result, open_result
+from uwsfm.results.log import job_log
+from uwsfm.results.summary import write_json
 
 SUMMARY = "summary.json"
 """Beside the cloud."""

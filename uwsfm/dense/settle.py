@@ -8,7 +8,7 @@ they tell little, the hypothesis itself counts: it spread there from where they 
 
 import numpy as np
 
-from uwsfm._jit import inner, inner_fused, kernel
+from uwsfm._base.jit import inner, inner_fused, kernel
 from uwsfm.dense.patch import RADIUS, affine, objection, shows, take_patch
 from uwsfm.dense.patchmatch import choose
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.dense.depth_map import DepthMap
 from uwsfm.dense.match import COST_BYTES, MULTIPLE, Gray
 from uwsfm.dense.rectify import Pair, Rectification, rectifications

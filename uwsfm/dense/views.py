@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.dense.rectify import Pair, rectifications
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import Scene
-from uwsfm.sfm.pixels import read_color, size_fault
+from uwsfm.sfm.frontend.pixels import read_color, size_fault
 
 MIN_POINTS = 10
 """Of a frame, to know its depths from; with fewer those of all frames serve."""

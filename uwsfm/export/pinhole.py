@@ -1,10 +1,10 @@
 """A refractive model as a central one: what stock dense and rendering tools take.
 
 Every camera becomes the pinhole that resembles it best at the distance of its scene
-(`uwsfm.sfm.pinhole_fit`), poses move to the virtual centres and every keypoint to where
-that pinhole would see it without refraction *at its own depth*. Points stay as they
-are. A keypoint's depth is that of its point, else it is interpolated between the
-points of its image (`ImageDepth`).
+(`uwsfm.sfm.rig_checks.pinhole_fit`), poses move to the virtual centres and every
+keypoint to where that pinhole would see it without refraction *at its own depth*.
+Points stay as they are. A keypoint's depth is that of its point, else it is
+interpolated between the points of its image (`ImageDepth`).
 """
 
 from dataclasses import dataclass, replace
@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.mapping_database import virtual_rig
-from uwsfm.sfm.pinhole_fit import (
+from uwsfm.sfm.pinhole.mapping_database import virtual_rig
+from uwsfm.sfm.rig_checks.pinhole_fit import (
     MAX_SLOPE,
     VirtualPinhole,
     fit_virtual_pinhole,

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import checked_target, replaced_dir
-from uwsfm._paths import inside
-from uwsfm._progress import Progress, silent
-from uwsfm.colmap import Model, to_reconstruction, write_model
+from uwsfm._base.files import checked_target, replaced_dir
+from uwsfm._base.paths import inside
+from uwsfm._base.progress import Progress, silent
+from uwsfm.colmap.model import Model, to_reconstruction, write_model
 from uwsfm.errors import InputError
 from uwsfm.export.pinhole import PinholeModel, pinhole_model
-from uwsfm.export.summary import write_json
 from uwsfm.export.trainers import (
     IMAGES,
     MASKS,
@@ -25,6 +24,7 @@ from uwsfm.export.trainers import (
     write_transforms,
 )
 from uwsfm.export.warp import read_image, warp_image, warp_maps, write_image
+from uwsfm.results.summary import write_json
 
 REPORT = "pinhole.json"
 

@@ -1,14 +1,15 @@
-"""The text format of Refractive COLMAP, see `uwsfm.sfm.refractive_colmap`: written."""
+"""The text format of Refractive COLMAP, see `uwsfm.sfm.from_colmap.refractive_colmap`:
+written."""
 
 import shutil
 from pathlib import Path
 
-from uwsfm._files import checked_target, replaced_dir
-from uwsfm._partial import scratch_folder
-from uwsfm._paths import shown, white_space_fault
-from uwsfm.colmap import Model, to_reconstruction
+from uwsfm._base.files import checked_target, replaced_dir
+from uwsfm._base.partial import scratch_folder
+from uwsfm._base.paths import shown, white_space_fault
+from uwsfm.colmap.model import Model, to_reconstruction
 from uwsfm.errors import InputError
-from uwsfm.sfm.refractive_colmap import (
+from uwsfm.sfm.from_colmap.refractive_colmap import (
     CAMERAS,
     IMAGES,
     POINTS,

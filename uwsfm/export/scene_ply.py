@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._files import checked_target
-from uwsfm._ply import RGB, XYZ, stacked_rows, write_ply
-from uwsfm.colmap import Model
+from uwsfm._base.files import checked_target
+from uwsfm._base.ply import RGB, XYZ, stacked_rows, write_ply
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera

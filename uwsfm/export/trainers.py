@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._ply import RGB, XYZ, stacked_rows, write_ply
-from uwsfm.colmap import Model
-from uwsfm.export.summary import write_json
+from uwsfm._base.ply import RGB, XYZ, stacked_rows, write_ply
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.results.summary import write_json
 
 TRANSFORMS = "transforms.json"
 POINTS = "sparse_pc.ply"

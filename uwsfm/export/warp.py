@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._files import replaced_file
-from uwsfm._paths import inside
+from uwsfm._base.files import replaced_file
+from uwsfm._base.paths import inside
 from uwsfm.errors import InputError
 from uwsfm.export.image_depth import ImageDepth
 from uwsfm.export.pinhole import img_from_virtual
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.sfm.pinhole_fit import VirtualPinhole
+from uwsfm.sfm.rig_checks.pinhole_fit import VirtualPinhole
 
 _BAND_PIXELS = 500_000
 """Projected at a time: bounds the memory of large images."""

@@ -17,7 +17,7 @@ sqrt(1 - k_i^2 p^2) + i k_i p, with p divided out. Scalar kernels; failure is Na
 
 import math
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 
 MAX_STEPS = 60
 # Below this share of R^2 the squared p takes the series: the quotient loses digits.

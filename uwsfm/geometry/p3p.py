@@ -11,7 +11,7 @@ central counterpart are not looked for: RANSAC draws another sample.
 import cmath
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.vec3 import dot
 
 NEWTON_STEPS = 8

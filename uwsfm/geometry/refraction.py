@@ -7,7 +7,7 @@ all rays through a flat port meet the axis along its normal.
 
 import math
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 
 MAX_STEPS = 60
 

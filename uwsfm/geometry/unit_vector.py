@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm._jit import kernel
+from uwsfm._base.jit import kernel
 from uwsfm.geometry.rigid3 import Array
 
 

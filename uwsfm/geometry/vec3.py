@@ -1,6 +1,6 @@
 """3-vectors as tuples, for kernels."""
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 
 
 @inner

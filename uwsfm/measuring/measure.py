@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import checked_target
+from uwsfm._base.files import checked_target
 from uwsfm.calibration.length_verdicts import ASK_FOR_LENGTH, scale_verdict
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.errors import InputError
-from uwsfm.export.summary import versions, write_json
-from uwsfm.export.verdict_summary import shown_word, verdict_note
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.measuring import quantities
 from uwsfm.measuring.measurements_file import Task, load_measurements
 from uwsfm.measuring.quantities import Quantity
 from uwsfm.measuring.spots import Spot, Spotter
-from uwsfm.result_folder import Result, open_result
+from uwsfm.results.folder import Result, open_result
+from uwsfm.results.summary import versions, write_json
+from uwsfm.results.verdict_summary import shown_word, verdict_note
 from uwsfm.trust.verdict import FITS
 
 DOUBTFUL, CONTRADICTION = 2.0, 4.0

@@ -27,11 +27,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PlainValidator, ValidationError
 
-from uwsfm._yaml import read_yaml
+from uwsfm._base.yaml import read_yaml
 from uwsfm.errors import InputError
 from uwsfm.measuring.picks import Pick, parsed_pick
-from uwsfm.rig_problems import first_problem
-from uwsfm.rig_schema import Entry
+from uwsfm.rig.problems import first_problem
+from uwsfm.rig.schema import Entry
 
 CLICK_STDDEV_PX = 1.0
 

@@ -20,8 +20,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from uwsfm.lengths_file import Click
-from uwsfm.rig_problems import first_problem
+from uwsfm.inputs.lengths_file import Click
+from uwsfm.rig.problems import first_problem
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _CLICK = re.compile(

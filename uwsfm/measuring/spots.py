@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from uwsfm.calibration.clicks import MAX_MISS, pixels_by_point
-from uwsfm.calibration.places import misses, placed
+from uwsfm.calibration.point_placement import misses, placed
 from uwsfm.calibration.propagation import Places, Propagation
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.known_lengths import check_click, image_index
+from uwsfm.inputs.known_lengths import check_click, image_index
 from uwsfm.measuring.measurements_file import Task
 from uwsfm.measuring.picks import Pick, PixelPick, PointPick, WorldPick
 from uwsfm.measuring.surface import (
@@ -23,7 +23,7 @@ from uwsfm.measuring.surface import (
     surface_of,
     views_of,
 )
-from uwsfm.result_folder import Result
+from uwsfm.results.folder import Result
 from uwsfm.scene import IndexArray, Scene
 
 SUSPICIOUS = 4.0

@@ -12,7 +12,7 @@ from uwsfm.cloud import read_cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import DENSE_CLOUD, Result, find_dense_cloud
+from uwsfm.results.folder import DENSE_CLOUD, Result, find_dense_cloud
 from uwsfm.scene import IndexArray, Scene
 
 NEIGHBOURS = 12

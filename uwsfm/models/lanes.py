@@ -9,7 +9,7 @@ scalar kernels of `uwsfm.models.projection`, which also know the reason of a fai
 import math
 from typing import Final
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 
 BLOCK: Final = 64
 """Lanes: eight AVX-512 registers; the rows of a Jacobian still fit the L1 cache."""

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens_wide import (

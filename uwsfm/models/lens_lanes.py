@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 from uwsfm.models.lanes import (
     BLOCK,
     LENS_U,

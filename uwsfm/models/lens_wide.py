@@ -13,7 +13,7 @@ They run in scalar kernels only: over lanes every row is left to those.
 import math
 from typing import Final
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.rigid3 import Array
 
 FOV: Final = 3

@@ -10,11 +10,7 @@ import math
 
 import numpy as np
 
-from uwsfm._jit import inner, kernel
-from uwsfm.models.dome import dome_air_ray, dome_jac, dome_water_ray
-from uwsfm.models.dome_lanes import dome_air_lanes, dome_jac_lanes, dome_ray_lanes
-from uwsfm.models.flat import flat_air_ray, flat_jac, flat_water_ray
-from uwsfm.models.flat_lanes import flat_air_lanes, flat_jac_lanes, flat_ray_lanes
+from uwsfm._base.jit import inner, kernel
 from uwsfm.models.lanes import (
     BLOCK,
     JAC_U,
@@ -30,7 +26,19 @@ from uwsfm.models.lanes import (
 )
 from uwsfm.models.lens import dir_from_img, img_from_dir, jac_by_params
 from uwsfm.models.lens_lanes import dir_lanes, img_lanes
-from uwsfm.models.port import DOME, KIND
+from uwsfm.models.ports.dome import dome_air_ray, dome_jac, dome_water_ray
+from uwsfm.models.ports.dome_lanes import (
+    dome_air_lanes,
+    dome_jac_lanes,
+    dome_ray_lanes,
+)
+from uwsfm.models.ports.flat import flat_air_ray, flat_jac, flat_water_ray
+from uwsfm.models.ports.flat_lanes import (
+    flat_air_lanes,
+    flat_jac_lanes,
+    flat_ray_lanes,
+)
+from uwsfm.models.ports.port import DOME, KIND
 from uwsfm.models.status import (
     BEHIND_CAMERA,
     NOT_FINITE,

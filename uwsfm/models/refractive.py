@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models import projection
-from uwsfm.models.caustic import caustic_points
 from uwsfm.models.lens import SUPPORTED_MODELS, lens_row, param_slots
-from uwsfm.models.port import FlatPort, Port
+from uwsfm.models.ports.caustic import caustic_points
+from uwsfm.models.ports.port import FlatPort, Port
 from uwsfm.models.status import VALID
 
 StatusArray = NDArray[np.uint8]

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from uwsfm.job_options import JobOptions
+from uwsfm.options.jobs import JobOptions
 
 
 def command_line(

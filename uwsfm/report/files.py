@@ -6,16 +6,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from uwsfm._files import replaced_dir, replaced_file
-from uwsfm._progress import Progress, silent
-from uwsfm._signals import interruption_in
+from uwsfm._base.files import replaced_dir, replaced_file
+from uwsfm._base.progress import Progress, silent
+from uwsfm._base.signals import interruption_in
 from uwsfm.calibration.problem import CalibrationResult, Covariance
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError
-from uwsfm.export.files import SUMMARY
-from uwsfm.export.summary import write_json
 from uwsfm.report.gather import FOLDER, NUMBERS, PAGE, gather, numbers_of
-from uwsfm.result_folder import open_result
+from uwsfm.results.files import SUMMARY
+from uwsfm.results.folder import open_result
+from uwsfm.results.summary import write_json
 
 
 def write_report(out: str | Path) -> Path:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from uwsfm.calibration.problem import Covariance
-from uwsfm.colmap import Model
-from uwsfm.export.verdict_summary import plain
+from uwsfm.colmap.model import Model
 from uwsfm.report.left_files import left_files
 from uwsfm.report.tables import Estimate, Frame, estimates, frames
 from uwsfm.report.view import View, view_of
 from uwsfm.report.words import Conclusions, small_lengths, unit_of, verdict_of
+from uwsfm.results.verdict_summary import plain
 from uwsfm.trust.residuals import FEWEST, CameraResiduals, camera_residuals
 
 PAGE, FOLDER, NUMBERS = "report.html", "report", "report.json"

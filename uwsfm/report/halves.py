@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.export.halves_summary import KEY
+from uwsfm.results.halves_summary import KEY
 from uwsfm.trust.halves_reason import NAMES
 
 

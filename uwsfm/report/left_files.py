@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from uwsfm.export.files import POINTS, SPARSE, WORK
-from uwsfm.result_folder import DENSE_CLOUD, fingerprint_of, read_told, told_of
+from uwsfm.results.files import POINTS, SPARSE, WORK
+from uwsfm.results.folder import DENSE_CLOUD, fingerprint_of, read_told, told_of
 
 _KINDS = {
     ".ply": "cloud or mesh",

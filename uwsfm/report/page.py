@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwsfm.export.verdict_summary import plain
 from uwsfm.report.gather import Report
 from uwsfm.report.halves import halves_of, halves_payload
 from uwsfm.report.tables import budget_columns, budget_lines, lengths_note
 from uwsfm.report.words import deviation, known_length_rows, position_words
+from uwsfm.results.verdict_summary import plain
 from uwsfm.trust.residuals import FEWEST, CameraResiduals, Profile, Residuals
 from uwsfm.trust.verdict import LENS_SHARE
 

@@ -11,18 +11,18 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._children import module_command
-from uwsfm._files import replaced_file
-from uwsfm._packages import import_package
-from uwsfm.colmap import Model
+from uwsfm._base.children import module_command
+from uwsfm._base.files import replaced_file
+from uwsfm._base.packages import import_package
+from uwsfm.colmap.model import Model
 from uwsfm.export.scene_ply import camera_lines
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.report.view import FRUSTUM_SHARE, strips
-from uwsfm.result_folder import Result, open_result
+from uwsfm.results.folder import Result, open_result
 
 RECORDING = "view.rrd"
 TIMELINE = "frame"

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._indices import distinct
+from uwsfm._base.indices import distinct
 from uwsfm.calibration.problem import Covariance
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.report.words import (

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.calibration.problem import Covariance
-from uwsfm.colmap import Model
+from uwsfm.colmap.model import Model
 from uwsfm.errors import UwsfmError
-from uwsfm.export.files import depth_stddev
 from uwsfm.export.scene_ply import camera_lines
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.results.files import depth_stddev
 from uwsfm.surface.level import level_by_plane
 
 MAX_POINTS = 100_000

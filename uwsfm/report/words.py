@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from uwsfm.export.verdict_summary import DOUBTFUL_WORD, WITHHELD, verdict_line
+from uwsfm.results.verdict_summary import DOUBTFUL_WORD, WITHHELD, verdict_line
 
 ARBITRARY_UNIT = "scale arbitrary"
 

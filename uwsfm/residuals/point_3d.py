@@ -10,7 +10,7 @@ unit direction r in the rig's frame, P = I - r r^T, and the point X,
 
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot, scaled
 from uwsfm.models.status import BEHIND_CAMERA, NO_INTERSECTION, NOT_FINITE, VALID

@@ -2,7 +2,7 @@
 
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.models.projection import lens_jac_of_point, project, project_with_jac
 from uwsfm.models.status import VALID
 from uwsfm.residuals.border import FIRST_LENS, RADIUS

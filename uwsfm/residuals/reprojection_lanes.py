@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from uwsfm._jit import inner, lane
+from uwsfm._base.jit import inner, lane
 from uwsfm.models.lanes import (
     BLOCK,
     JAC_U,

@@ -16,7 +16,7 @@ e shrinks with f, so it is no measure for d: any error vanishes where f does.
 
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot
 from uwsfm.models.status import BEHIND_CAMERA, NOT_FINITE, VALID

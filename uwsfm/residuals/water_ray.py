@@ -11,7 +11,7 @@ All of it is smooth in the port, also where the distance passes through zero.
 
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.refraction import slope
 from uwsfm.models.status import MISSES_PORT, OUTSIDE_LENS, TOTAL_REFLECTION, VALID
 

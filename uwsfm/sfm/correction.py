@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from uwsfm.rig import Rig, RigCamera
+from uwsfm.rig.rig import Rig, RigCamera
 
 CODES = (
     "port_none",

@@ -26,8 +26,8 @@ from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.tracks import match_gaps_px
-from uwsfm.sfm.relative_pose import MEDIAN_GAP, estimate_relative_pose
-from uwsfm.sfm.relative_pose_options import RelativePoseOptions
+from uwsfm.sfm.poses.relative_pose import MEDIAN_GAP, estimate_relative_pose
+from uwsfm.sfm.poses.relative_pose_options import RelativePoseOptions
 from uwsfm.sfm.scene_points import views_of
 from uwsfm.solver.layout import HELD, build_layout
 from uwsfm.solver.levenberg_marquardt import LevenbergMarquardtOptions, minimize

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from uwsfm._options import Checked, group, option
+from uwsfm._base.options import Checked, group, option
+from uwsfm._base.tasks import LOCAL, require_address, require_threads
 from uwsfm.errors import InputError
-from uwsfm.tasks import LOCAL, require_address, require_threads
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Matcher = Literal["colmap", "paper"]

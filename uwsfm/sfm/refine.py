@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.clicks import check_clicks, with_click_noise
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.scaling import scaled, start_scale
 from uwsfm.errors import UwsfmError
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.scene_points import agreeing_points, good_observations
 from uwsfm.sfm.second_start import better_start

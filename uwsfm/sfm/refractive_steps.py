@@ -10,10 +10,11 @@ from functools import cache
 
 import numpy as np
 
-from uwsfm._progress import Progress
-from uwsfm.rig import Rig
-from uwsfm.sfm.fixed_rig import FixedRig, mapping_summary, turned_to
-from uwsfm.sfm.images import Frames
+from uwsfm._base.progress import Progress
+from uwsfm._base.tasks import Workers
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.images import Frames
+from uwsfm.sfm.frontend.parallel import workers_of
 from uwsfm.sfm.mapping.correspondences import Correspondences, read_correspondences
 from uwsfm.sfm.mapping.incremental import map_incrementally
 from uwsfm.sfm.mapping.refractive_start import (
@@ -22,14 +23,13 @@ from uwsfm.sfm.mapping.refractive_start import (
     write_refractive_start,
 )
 from uwsfm.sfm.options import StartOptions
-from uwsfm.sfm.parallel import workers_of
 from uwsfm.sfm.refine import rig_options
+from uwsfm.sfm.rig_checks.fixed_rig import FixedRig, mapping_summary, turned_to
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.submaps.merging import merge_submaps
 from uwsfm.sfm.submaps.splitting import part_size
 from uwsfm.sfm.submaps.survey import map_parts, read_all
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.tasks import Workers
 
 
 def map_refractively(

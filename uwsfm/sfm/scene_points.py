@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._indices import renumbered
+from uwsfm._base.indices import renumbered
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows, max_ray_angles, triangulate_tracks
 from uwsfm.geometry.rigid3 import Array

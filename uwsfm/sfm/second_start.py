@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.errors import UwsfmError
-from uwsfm.models.port import FlatPort, Port
+from uwsfm.models.ports.port import FlatPort, Port
 from uwsfm.scene import Scene
 
 FAR_FACTOR, FAR_M = 3.0, 0.02

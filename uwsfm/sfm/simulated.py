@@ -8,10 +8,10 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array, triu
 
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.images import Frames
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.images import Frames
 
 MIN_MATCHES = 15
 """Images that share fewer points are not matched."""

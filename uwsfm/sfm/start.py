@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from uwsfm._files import replaced_file
-from uwsfm._progress import Progress, silent
-from uwsfm.rig import Rig
-from uwsfm.sfm.background import remove_database
-from uwsfm.sfm.baseline import rig_from_baseline
-from uwsfm.sfm.features import extract_features, store_intrinsics
-from uwsfm.sfm.fixed_rig import FixedRig, fix_rig, mapping_summary
-from uwsfm.sfm.images import (
+from uwsfm._base.files import replaced_file
+from uwsfm._base.progress import Progress, silent
+from uwsfm._base.tasks import Workers
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.background import remove_database
+from uwsfm.sfm.frontend.features import extract_features, store_intrinsics
+from uwsfm.sfm.frontend.images import (
     Frames,
     check_masks,
     find_frames,
@@ -28,23 +27,24 @@ from uwsfm.sfm.images import (
     mask_warnings,
     range_warnings,
 )
-from uwsfm.sfm.mapping.refractive_start import RefractiveStart
-from uwsfm.sfm.mapping_database import write_mapping_database
-from uwsfm.sfm.matching import clear_matches, match_features
-from uwsfm.sfm.options import FeatureOptions, StartOptions
-from uwsfm.sfm.parallel import (
+from uwsfm.sfm.frontend.matching import clear_matches, match_features
+from uwsfm.sfm.frontend.parallel import (
     FEATURES,
     MATCHES,
     extract_elsewhere,
     match_elsewhere,
     workers_of,
 )
-from uwsfm.sfm.perspective import PerspectiveStart, load_start, write_start
-from uwsfm.sfm.pinhole_search import search_models
+from uwsfm.sfm.mapping.refractive_start import RefractiveStart
+from uwsfm.sfm.options import FeatureOptions, StartOptions
+from uwsfm.sfm.pinhole.mapping_database import write_mapping_database
+from uwsfm.sfm.pinhole.perspective import PerspectiveStart, load_start, write_start
 from uwsfm.sfm.refractive_steps import map_refractively
+from uwsfm.sfm.rig_checks.baseline import rig_from_baseline
+from uwsfm.sfm.rig_checks.fixed_rig import FixedRig, fix_rig, mapping_summary
+from uwsfm.sfm.rig_checks.pinhole_search import search_models
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.tasks import Workers
 
 Start = PerspectiveStart | RefractiveStart
 """Where mapping ended, by the mapper that was asked for."""

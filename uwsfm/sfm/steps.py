@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import replaced_file
-from uwsfm._partial import remove_stale
-from uwsfm.sfm.background import damaged
+from uwsfm._base.files import replaced_file
+from uwsfm._base.partial import remove_stale
+from uwsfm.sfm.frontend.background import damaged
 
 FILE_NAME = "steps.json"
 FORMAT = 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from uwsfm.sfm.features import COLORS
+from uwsfm.sfm.frontend.features import COLORS
 
 
 @dataclass(frozen=True, kw_only=True)

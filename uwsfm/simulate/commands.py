@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm._files import checked_target
-from uwsfm._progress import Progress, silent
+from uwsfm._base.files import checked_target
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.observation_file import write_observations

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate.rigs import known_cam_from_rig
 
 

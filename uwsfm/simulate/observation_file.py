@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from uwsfm._files import replaced_file
-from uwsfm._npz import read_npz
+from uwsfm._base.files import replaced_file
+from uwsfm._base.npz import read_npz
 from uwsfm.errors import InputError
-from uwsfm.models.port import port_from_row
+from uwsfm.models.ports.port import port_from_row
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
 from uwsfm.simulate.observations import SimulatedScene

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._packages import import_package
+from uwsfm._base.packages import import_package
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.simulate.texture import Texture
 

@@ -10,8 +10,8 @@ from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, Port
-from uwsfm.rig import Rig, RigCamera
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.rig.rig import Rig, RigCamera
 
 PAPER_TILTS_DEG = ((2.0, 40.0), (1.0, -10.0))
 """Tilt and azimuth of the left and the right port normal."""

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pycolmap
 
-from uwsfm._checksums import write_checksums
-from uwsfm._files import replaced_dir
-from uwsfm._paths import inside
-from uwsfm._progress import Progress, silent
+from uwsfm._base.checksums import write_checksums
+from uwsfm._base.files import replaced_dir
+from uwsfm._base.paths import inside
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
-from uwsfm.rig import Rig
-from uwsfm.rig_file import dump_rig
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.rig.file import dump_rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate.footprints import footprints
 from uwsfm.simulate.raycasting import RayScene
 from uwsfm.simulate.relief import Relief

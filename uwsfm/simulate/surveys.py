@@ -7,7 +7,7 @@ import numpy as np
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.simulate.observations import (
     ObservationOptions,
     SimulatedScene,

@@ -4,7 +4,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import inner_straight, lane
+from uwsfm._base.jit import inner_straight, lane
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
 from uwsfm.solver.chunks import GRAD, width

@@ -6,7 +6,7 @@ its coupling to the border (``couple``), and the border's own blocks.
 
 import numpy as np
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.models.status import VALID
 from uwsfm.residuals import point_3d, reprojection, virtual_camera
 from uwsfm.solver.error_models import (

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lanes import BLOCK, OK, PX, PY, SIZE, STRIDE, X, Y, Z
 from uwsfm.models.lens import NUM_PARAMS

@@ -23,7 +23,7 @@ given back, all else held: the border is shared by all clusters, and hardly one'
 
 import numpy as np
 
-from uwsfm._jit import inner, kernel
+from uwsfm._base.jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.projection import JAC_SIZE
 from uwsfm.models.status import VALID

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm._jit import inner, kernel
+from uwsfm._base.jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.solver import schur
 from uwsfm.solver.assembly import expand_cells
-from uwsfm.solver.block_graph import find_block
 from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.linear import schur
+from uwsfm.solver.linear.block_graph import find_block
+from uwsfm.solver.linear.reduced_factor import Inverse, inverse
+from uwsfm.solver.linear.reduction import Reduction, analyse
 from uwsfm.solver.normal_equations import NormalEquations
-from uwsfm.solver.reduced_factor import Inverse, inverse
-from uwsfm.solver.reduction import Reduction, analyse
 from uwsfm.solver.threads import chunk_bounds, num_threads, run_chunks
 
 

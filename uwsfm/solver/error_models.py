@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import kernel
+from uwsfm._base.jit import kernel
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array

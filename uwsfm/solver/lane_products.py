@@ -10,7 +10,7 @@ from typing import Final
 
 from numba.extending import register_jitable
 
-from uwsfm._jit import inner_fused, lane
+from uwsfm._base.jit import inner_fused, lane
 from uwsfm.models.lanes import BLOCK, JAC_U, JAC_V, STRIDE
 from uwsfm.residuals.reprojection_lanes import RESIDUAL, RIG
 from uwsfm.solver.losses import CAUCHY

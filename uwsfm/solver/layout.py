@@ -50,7 +50,8 @@ class Layout(NamedTuple):
     num_nav_cols: int
     """6 if nav_from_world is estimated, else 0: after the cameras' columns."""
     num_lengths: int
-    """Known lengths, one column each at the end: see `uwsfm.solver.quasidefinite`."""
+    """Known lengths, one column each at the end: see
+    `uwsfm.solver.linear.quasidefinite`."""
 
     @property
     def num_frame_cols(self) -> int:

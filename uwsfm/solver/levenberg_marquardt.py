@@ -12,9 +12,13 @@ from threadpoolctl import ThreadpoolController
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.solver import schur
 from uwsfm.solver.error_models import REPROJECTION, ErrorModel, error_model
+from uwsfm.solver.inner_iterations import settled
 from uwsfm.solver.layout import HELD, Layout
+from uwsfm.solver.linear import schur
+from uwsfm.solver.linear.reduced_steps import StepSolver
+from uwsfm.solver.linear.reduction import DENSE, Reduction, analyse
+from uwsfm.solver.linear.schur import ReducedSystem
 from uwsfm.solver.losses import LOSS_CODES
 from uwsfm.solver.normal_equations import (
     MIN_DIAGONAL,
@@ -24,10 +28,6 @@ from uwsfm.solver.normal_equations import (
     squared_errors,
     total_cost,
 )
-from uwsfm.solver.reduced_steps import StepSolver
-from uwsfm.solver.reduction import DENSE, Reduction, analyse
-from uwsfm.solver.schur import ReducedSystem
-from uwsfm.solver.settling import settled
 from uwsfm.solver.state import State
 from uwsfm.solver.threads import num_threads
 from uwsfm.solver.workspace import Workspace
@@ -255,7 +255,8 @@ def minimize(
 
     Marquardt scaling by max(diagonal, 1e-6); the damping falls by
     max(1/100, 1 - (2 rho - 1)^3) on success and grows twice as fast at each failure. A
-    step that falls short is tried with settled points, too: `uwsfm.solver.settling`.
+    step that falls short is tried with settled points, too:
+    `uwsfm.solver.inner_iterations`.
 
     Raises:
         UwsfmError: the start is so wrong that nothing can be projected.

@@ -2,7 +2,7 @@
 
 import math
 
-from uwsfm._jit import inner
+from uwsfm._base.jit import inner
 
 L2, CAUCHY = 0, 1
 LOSS_CODES = {"l2": L2, "cauchy": CAUCHY}

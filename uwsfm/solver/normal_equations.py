@@ -6,14 +6,14 @@ the rig, the pose enters by M = [-[q]x, I] and the point by the frame's rotation
 
     U += M^T H M,   W = M^T H R,   V += R^T H R
 
-The points are eliminated by `uwsfm.solver.schur`.
+The points are eliminated by `uwsfm.solver.linear.schur`.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from uwsfm._jit import inner, kernel
+from uwsfm._base.jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.residuals.reprojection import point_in_rig

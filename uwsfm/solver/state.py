@@ -9,7 +9,7 @@ import numpy as np
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, with_limit
-from uwsfm.models.port import DOME, KIND, port_from_row
+from uwsfm.models.ports.port import DOME, KIND, port_from_row
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout

@@ -36,7 +36,7 @@ def skew_matrices(vectors: Array) -> Array:
 class LengthTerm:
     """Known distances, between points or between rig origins.
 
-    Each has a column at the end of the border, see `uwsfm.solver.quasidefinite`.
+    Each has a column at the end of the border, see `uwsfm.solver.linear.quasidefinite`.
     """
 
     ends: IndexArray

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._packages import import_package
+from uwsfm._base.packages import import_package
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.surface.mesh import Mesh
 

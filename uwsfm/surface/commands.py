@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._files import checked_target, replaced_dir, replaced_file
-from uwsfm._packages import import_package
-from uwsfm._ply import write_ply
-from uwsfm._progress import Progress, silent
+from uwsfm._base.files import checked_target, replaced_dir, replaced_file
+from uwsfm._base.packages import import_package
+from uwsfm._base.ply import write_ply
+from uwsfm._base.progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.summary import write_json
+from uwsfm.export.las import write_las
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import MAP, MESH, Result, open_result
+from uwsfm.results.folder import MAP, MESH, Result, open_result
+from uwsfm.results.summary import write_json
 from uwsfm.surface.atlas import make_atlas
 from uwsfm.surface.clean import Filter, clean_points, default_options
 from uwsfm.surface.connected import main_parts
@@ -27,7 +28,6 @@ from uwsfm.surface.geotiff import (
     write_origin_tiff,
 )
 from uwsfm.surface.height_map import FILLED, make_height_map
-from uwsfm.surface.las import write_las
 from uwsfm.surface.level import world_from_map
 from uwsfm.surface.mesh import decimated, distances_to_cloud, make_mesh
 from uwsfm.surface.mesh_files import (
@@ -155,7 +155,7 @@ def _stray_warnings(strays: Cloud, cloud: Cloud) -> list[str]:
 
 
 def export_las(source: str | Path, path: str | Path, suffix: str) -> Cloud:
-    """Write a cloud as LAS or LAZ; see `uwsfm.surface.las`.
+    """Write a cloud as LAS or LAZ; see `uwsfm.export.las`.
 
     Args:
         source: result folder, or a PLY of its.

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._files import replaced_file
-from uwsfm._packages import import_package
+from uwsfm._base.files import replaced_file
+from uwsfm._base.packages import import_package
 from uwsfm.surface.height_map import HeightMap
 
 # Tags and keys of the GeoTIFF standard (OGC 19-008r4), and GDAL's for missing data.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from uwsfm._packages import import_package
+from uwsfm._base.packages import import_package
 from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.rigid3 import Array

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from uwsfm._files import replaced_file
-from uwsfm._ply import write_ply
+from uwsfm._base.files import replaced_file
+from uwsfm._base.ply import write_ply
 from uwsfm.color.encoding import light_of
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm._files import replaced_file
+from uwsfm._base.files import replaced_file
 from uwsfm.surface.height_map import HeightMap
 from uwsfm.surface.units import short_unit
 

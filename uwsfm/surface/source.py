@@ -8,16 +8,10 @@ from numpy.lib.recfunctions import append_fields
 
 from uwsfm.cloud import UNKNOWN_UNIT, Cloud, cloud_of_table, read_table, unit_of_cloud
 from uwsfm.errors import InputError
-from uwsfm.export.files import (
-    POINTS,
-    SPARSE,
-    read_model,
-    read_summary,
-    unit_of_model,
-)
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.result_folder import (
+from uwsfm.results.files import POINTS, SPARSE, read_model, read_summary, unit_of_model
+from uwsfm.results.folder import (
     DENSE_CLOUD,
     find_dense_cloud,
     fingerprint_of,

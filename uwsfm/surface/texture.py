@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._packages import import_package
-from uwsfm._progress import Progress, silent
-from uwsfm.colmap import Model
+from uwsfm._base.packages import import_package
+from uwsfm._base.progress import Progress, silent
+from uwsfm.colmap.model import Model
 from uwsfm.dense.exposure import SeenColors, balancing_gains
 from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.views import load_image

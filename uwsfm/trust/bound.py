@@ -6,7 +6,7 @@ import numpy as np
 
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import PRIORS, CalibrationResult
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.scene import Scene
 
 STEP_M = 0.005

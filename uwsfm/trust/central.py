@@ -8,7 +8,7 @@ import pycolmap
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.port import FlatPort, NoPort, Port
+from uwsfm.models.ports.port import FlatPort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 
 _LEAST_MODEL = "OPENCV"

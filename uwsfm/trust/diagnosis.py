@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResult
-from uwsfm.models.port import DomePort, FlatPort
-from uwsfm.rig import Rig
+from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.sfm.lens_mistakes import OF_DISTORTION
+from uwsfm.sfm.rig_checks.lens_mistakes import OF_DISTORTION
 from uwsfm.solver.threads import limited
 from uwsfm.trust.explanation import (
     AS_GOOD,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.models.port import FlatPort
+from uwsfm.models.ports.port import FlatPort
 from uwsfm.trust.mistakes import Trial
 from uwsfm.trust.trials import TRIMMED, Fit
 

@@ -14,10 +14,10 @@ import numpy as np
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import BROWN, KIND, NUM_PARAMS, PINHOLE
-from uwsfm.models.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
-from uwsfm.rig import Rig, RigCamera
+from uwsfm.rig.rig import Rig, RigCamera
 from uwsfm.solver.layout import HELD
 
 DISTANCE_SHARE, DISTANCE_M = 0.5, 0.005

@@ -14,7 +14,7 @@ import numpy as np
 from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.noise_floor import NoiseFloor
 from uwsfm.trust.bound import pull_below_zero

@@ -21,7 +21,7 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.trust.projections import ProjectionMap, projection_map
 from uwsfm.trust.shared_numbers import SharedNumber, SharedNumbers, shared_numbers

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.trust.mistakes import FOCAL, FREE, MIN_FRAMES_LEFT, Trial, shifts
 from uwsfm.trust.trials import Fit, adjusted

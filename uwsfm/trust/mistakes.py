@@ -1,7 +1,8 @@
 """Each mistake that people make, undone: a rig and observations to try.
 
-Those of the rig file alone are in `uwsfm.sfm.rig_mistakes`, where refusals find them;
-here are the others: what is wrong with the images, and numbers that are set free.
+Those of the rig file alone are in `uwsfm.sfm.rig_checks.rig_mistakes`, where refusals
+find them; here are the others: what is wrong with the images, and numbers that are set
+free.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ import numpy as np
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DomePort, FlatPort, Port
-from uwsfm.rig import Rig, RigCamera
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.rig.rig import Rig, RigCamera
 from uwsfm.scene import Scene
 from uwsfm.sfm.correction import Correction, quoted, subsets
-from uwsfm.sfm.lens_mistakes import distortion, num_pinhole
-from uwsfm.sfm.rig_mistakes import (
+from uwsfm.sfm.rig_checks.lens_mistakes import distortion, num_pinhole
+from uwsfm.sfm.rig_checks.rig_mistakes import (
     SHIFTS,
     corrected_pixels,
     corrections,

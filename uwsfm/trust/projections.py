@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import NoPort
-from uwsfm.rig import Rig
+from uwsfm.models.ports.port import NoPort
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 
 COLUMNS, ROWS = 8, 6

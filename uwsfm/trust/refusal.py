@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import ExplainedInputError, InputError, UwsfmError
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.refine import Refined, refine_scene
 from uwsfm.trust.diagnosis import KEPT, diagnose

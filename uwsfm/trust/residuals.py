@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import NoPort
+from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
-from uwsfm.sfm.pinhole_fit import fit_virtual_pinhole
+from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
 from uwsfm.trust.central import FittedCamera, fit_central, fit_lens
 
 COLUMNS, FEWEST_COLUMNS = 14, 5

@@ -13,7 +13,7 @@ from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD

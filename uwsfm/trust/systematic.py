@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm._indices import renumbered
+from uwsfm._base.indices import renumbered
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
 

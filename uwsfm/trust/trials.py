@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.given_accuracy import CameraAccuracy, RigAccuracy
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.outside import Outside
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.calibration.run import Run
+from uwsfm.calibration.solves import Run
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import FlatPort
-from uwsfm.rig import Rig
+from uwsfm.models.ports.port import FlatPort
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.refine import rig_options
 from uwsfm.sfm.scene_points import retriangulated

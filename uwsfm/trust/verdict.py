@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from uwsfm._indices import distinct
+from uwsfm._base.indices import distinct
 from uwsfm.sfm.noise_floor import NoiseFloor, noise_floor
 from uwsfm.trust.departed import departed_reasons
 from uwsfm.trust.freed import Freed
@@ -23,7 +23,7 @@ from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 
 if TYPE_CHECKING:
     from uwsfm.calibration.problem import CalibrationResult
-    from uwsfm.rig import Rig
+    from uwsfm.rig.rig import Rig
     from uwsfm.sfm.refine import Refined
 
 Word = Literal["fits", "doubtful", "does not fit"]

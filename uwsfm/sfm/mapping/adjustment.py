@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm._indices import renumbered
+from uwsfm._base.indices import renumbered
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.models.port import FLAT, KIND, DomePort, FlatPort
+from uwsfm.models.ports.port import FLAT, KIND, DomePort, FlatPort
 from uwsfm.residuals.border import BORDER_SIZE
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.mapping.growing_map import GrowingMap, Mask
 from uwsfm.sfm.refine import rig_options

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from uwsfm._indices import renumbered
+from uwsfm._base.indices import renumbered
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import opened
-from uwsfm.sfm.images import Frames
-from uwsfm.sfm.mapping_database import indices_of
+from uwsfm.sfm.frontend.background import opened
+from uwsfm.sfm.frontend.images import Frames
+from uwsfm.sfm.pinhole.mapping_database import indices_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.adjustment import (
     Housings,

@@ -10,10 +10,10 @@ import numpy as np
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.epipolar import ray_pairs
 from uwsfm.sfm.mapping.growing_map import GrowingMap, Mask
-from uwsfm.sfm.relative_pose import estimate_rig_relative_poses
-from uwsfm.sfm.relative_pose_options import RelativePoseOptions
+from uwsfm.sfm.poses.epipolar import ray_pairs
+from uwsfm.sfm.poses.relative_pose import estimate_rig_relative_poses
+from uwsfm.sfm.poses.relative_pose_options import RelativePoseOptions
 
 MIN_POINTS = 30
 """That the cameras of a first frame see together, or two first frames."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._jit import kernel
+from uwsfm._base.jit import kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.sfm.mapping.triangulation import Views, squared_error
 

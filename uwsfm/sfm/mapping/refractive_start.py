@@ -9,15 +9,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from uwsfm._files import replaced_dir
+from uwsfm._base.files import replaced_dir
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import port_from_row
+from uwsfm.models.ports.port import port_from_row
 from uwsfm.models.refractive import RefractiveCamera
-from uwsfm.rig import Rig
-from uwsfm.sfm.background import DAMAGE, damaged
-from uwsfm.sfm.images import Frames
+from uwsfm.rig.rig import Rig
+from uwsfm.sfm.frontend.background import DAMAGE, damaged
+from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.mapping.growing_map import GrowingMap
-from uwsfm.sfm.perspective import StartArrays, real_keypoints
+from uwsfm.sfm.pinhole.perspective import StartArrays, real_keypoints
 from uwsfm.solver.state import State
 
 START_FILE = "start.json"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwsfm._indices import distinct
+from uwsfm._base.indices import distinct
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.absolute_pose import AbsolutePoseOptions, estimate_rig_pose
 from uwsfm.sfm.mapping.growing_map import GrowingMap
+from uwsfm.sfm.poses.absolute_pose import AbsolutePoseOptions, estimate_rig_pose
 
 GRID_LEVELS = (2, 4, 8, 16)
 """Cells along each side of an image in which visible points are counted."""

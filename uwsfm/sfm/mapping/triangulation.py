@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm._jit import inner, kernel
+from uwsfm._base.jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.vec3 import add, cross, dot
 from uwsfm.models.projection import JAC_SIZE, project_with_jac

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from uwsfm._progress import Progress, silent
+from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.joint_alignment import Link, Placement, align_jointly
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.port import DOME, KIND, port_from_row
-from uwsfm.rig import Rig
+from uwsfm.models.ports.port import DOME, KIND, port_from_row
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uwsfm._files import replaced_file
+from uwsfm._base.files import replaced_file
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import DAMAGE, damaged
+from uwsfm.sfm.frontend.background import DAMAGE, damaged
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.mapping.growing_map import GrowingMap
 from uwsfm.sfm.mapping.incremental import map_incrementally

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from uwsfm._files import replaced_file
-from uwsfm._progress import Progress, silent
+from uwsfm._base.files import replaced_file
+from uwsfm._base.progress import Progress, silent
+from uwsfm._base.tasks import Workers
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.rig import Rig
+from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
-from uwsfm.sfm.background import DAMAGE, damaged
+from uwsfm.sfm.frontend.background import DAMAGE, damaged
 from uwsfm.sfm.mapping.correspondences import Correspondences
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.submaps.splitting import split
 from uwsfm.sfm.submaps.submap import Submap, map_submap, read_submaps, write_input
-from uwsfm.tasks import Workers
 
 PARTS = "parts.npz"
 
