@@ -55,7 +55,7 @@ def test_what_does_not_fit_is_written_and_ends_with_its_own_code(wrong_dive):
     found, out = wrong_dive
     assert found.exit_code == NO_FIT == 3, found.output
     summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
-    assert list(summary)[:3] == ["verdict", "reasons", "goodness"]
+    assert list(summary)[:4] == ["schema_version", "verdict", "reasons", "goodness"]
     assert summary["verdict"] == "does not fit"
     for name in (HOUSING, PAGE, "points.ply", "calibration.npz"):
         assert (out / name).is_file()
@@ -115,7 +115,7 @@ def test_measure_and_report_say_the_same_of_the_stored_result(wrong_dive):
 
 def test_what_fits_is_said_first_and_keeps_its_words(dive_result):
     summary = dive_result.result.summary
-    assert list(summary)[:3] == ["verdict", "reasons", "goodness"]
+    assert list(summary)[:4] == ["schema_version", "verdict", "reasons", "goodness"]
     assert summary["verdict"] == dive_result.result.verdict.verdict == "fits"
     assert summary["reasons"] == []
     assert summary["scale"]["verdict"] == "determined"
