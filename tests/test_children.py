@@ -63,7 +63,7 @@ def test_compilers_are_those_of_the_parent(hostile):
     process = first_run._start("no such job")
     _, errors = process.communicate(timeout=60)
     assert "KeyError: 'no such job'" in errors
-    assert str(PACKAGE / "first_run.py") in errors
+    assert str(PACKAGE / "jobs/compile_kernels.py") in errors
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Dask itself starts unsafely")
@@ -77,6 +77,6 @@ def test_workers_are_those_of_the_parent(hostile):
 
 def test_no_process_is_started_in_another_way():
     for path in PACKAGE.rglob("*.py"):
-        if path.name != "_children.py":
+        if path.name != "children.py":
             text = path.read_text(encoding="utf-8")
             assert "sys.executable" not in text, path

@@ -25,8 +25,7 @@ BANNED = re.compile(
     r"\btells\b|\bis told\b|\bsays so\b|\bnobody tells\b", re.IGNORECASE
 )
 PACKAGE = Path(uwsfm.__file__).parent
-PRINTING = [*PACKAGE.glob("cli*.py"), PACKAGE / "console.py"]
-PRINTING += [PACKAGE / "result_tables.py", PACKAGE / "job_options.py"]
+PRINTING = [*(PACKAGE / "cli").glob("*.py"), PACKAGE / "options" / "jobs.py"]
 
 
 def walked(command, name="uwsfm"):

@@ -94,8 +94,8 @@ def test_another_installation_keeps_kernels_of_its_own(tmp_path):
     """Numba would not take those of the first, though nothing differs but the place."""
     package = Path(uwsfm.__file__).parent
     shutil.copytree(package, tmp_path / "other" / "uwsfm", copy_function=shutil.copy2)
-    code = "import sys; sys.path.insert(0, sys.argv[1]); from uwsfm import _jit;"
-    code += "print(_jit.CACHE_DIR)"
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from uwsfm._base import jit;"
+    code += "print(jit.CACHE_DIR)"
     places = [str(package.parent), str(tmp_path / "other")]
     runs = [start(code, place, UWSFM_CACHE_DIR=str(tmp_path)) for place in places]
     assert len({output(run) for run in runs}) == 2

@@ -10,7 +10,7 @@ from uwsfm._base.last_words import is_out_of_memory, unexpected
 FAULT = """
 import sys
 import uwsfm._base.files
-from uwsfm import cli
+from uwsfm.cli import app as cli
 def broken(*_, **__):
     raise {error}
 uwsfm._base.files.replaced_file = broken

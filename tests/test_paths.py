@@ -114,17 +114,17 @@ READ = {
     ("dense/views.py", "folder / name"),
     ("export/pinhole_files.py", "images / model.image_name(c, f)"),
     ("export/pinhole_files.py", "images / name"),
-    ("known_lengths.py", "PurePosixPath(camera.images) / name"),
-    ("refine_pipeline.py", "images / camera.images"),
-    ("refine_pipeline.py", "images / camera.images / n"),
+    ("inputs/known_lengths.py", "PurePosixPath(camera.images) / name"),
+    ("jobs/refine_model.py", "images / camera.images"),
+    ("jobs/refine_model.py", "images / camera.images / n"),
     ("report/recording.py", "result.images / model.image_name(index, frame)"),
-    ("sfm/image_features.py", "image_dir / name"),
-    ("sfm/images.py", "Path(mask_dir) / f'{next(frames.image_names())}.png'"),
-    ("sfm/images.py", "mask_dir / n"),
-    ("sfm/images.py", "image_dir / folder"),
-    ("sfm/images.py", "image_dir / image_name"),
-    ("sfm/images.py", "self.image_dir / n"),
-    ("sfm/parallel.py", "frames.image_dir / next(frames.image_names())"),
+    ("sfm/frontend/image_features.py", "image_dir / name"),
+    ("sfm/frontend/images.py", "Path(mask_dir) / f'{next(frames.image_names())}.png'"),
+    ("sfm/frontend/images.py", "mask_dir / n"),
+    ("sfm/frontend/images.py", "image_dir / folder"),
+    ("sfm/frontend/images.py", "image_dir / image_name"),
+    ("sfm/frontend/images.py", "self.image_dir / n"),
+    ("sfm/frontend/parallel.py", "frames.image_dir / next(frames.image_names())"),
 }
 """Paths of images and masks that are only read."""
 FROM_DATA = re.compile(r"image|\bname\b|frame_name|folder\b|\bn\b")
@@ -145,10 +145,10 @@ def _joins():
 def test_no_other_path_is_made_of_the_name_of_an_image():
     """A new one is either only read, and then listed here, or goes through `inside`."""
     found = {join for join in _joins() if not OWN.search(join[1].split(" / ")[-1])}
-    own = {("_paths.py", "folder / PurePosixPath(name)")}
-    own |= {("_checksums.py", "folder / name")}
+    own = {("_base/paths.py", "folder / PurePosixPath(name)")}
+    own |= {("_base/checksums.py", "folder / name")}
     # What a user's own dives.yaml names is the user's choice, as on the command line.
-    own |= {join for join in found if join[0] == "dives_file.py"}
+    own |= {join for join in found if join[0] == "jobs/dives_file.py"}
     assert found - READ - own == set()
     assert READ - found == set(), "no longer there"
 
@@ -163,5 +163,5 @@ def test_images_are_written_by_one_function_and_the_renderer():
     assert writers == {
         "export/warp.py",
         "simulate/sequence.py",
-        "sfm/image_features.py",
+        "sfm/frontend/image_features.py",
     }

@@ -12,7 +12,7 @@ from uwsfm._base.signals import STOPPING
 STOPPED = """
 import os, signal, sys, time
 import typer
-from uwsfm import cli
+from uwsfm.cli import app as cli
 
 @cli.app.command()
 def wait():
@@ -52,7 +52,7 @@ def test_signals_end_in_the_sentence_of_an_interrupted_run(name, code, form):
 SLOW = """
 import os, signal, sys, time
 from concurrent.futures import ThreadPoolExecutor
-from uwsfm import cli
+from uwsfm.cli import app as cli
 
 @cli.app.command()
 def wait():

@@ -57,6 +57,7 @@ def test_the_verdict_comes_first_and_tones_the_words_down():
     }
     found = with_verdict(verdict, summary)
     assert list(found) == [
+        "schema_version",
         "verdict",
         "reasons",
         "goodness",
