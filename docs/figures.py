@@ -79,11 +79,11 @@ def refraction() -> None:
 
 
 ROWS = (
-    ("command line", "cli · console"),
-    ("whole jobs", "pipeline · refine_pipeline · batch · check"),
-    ("from a result", "report · dense · surface · color · measuring · export"),
-    ("verdict", "trust"),
-    ("images to map", "sfm · colmap · simulate · rig_file"),
+    ("command line", "cli"),
+    ("whole jobs", "jobs"),
+    ("from a result", "report · surface · dense · color · measuring · export"),
+    ("results, verdict", "results · trust"),
+    ("images to map", "options · sfm · colmap · simulate · inputs · rig"),
     ("what is refined", "calibration"),
     ("least squares", "solver · residuals · scene"),
     ("rays", "models · geometry"),
