@@ -6,8 +6,9 @@ OUT is that of pipeline.py; what is there is not made again. The scenes are its 
 and its near dive, as a stereo rig and as the left camera alone. ``--also`` scores
 another program's cloud (a PLY) of the same images; SPARSE is its COLMAP model. Image
 centres place a cloud on the truth, with a scale, and from there it moves to where it
-fits the surface best: a pinhole has its centre elsewhere than the camera. Tolerances are
-for a metre: they grow with the distance from the nearest camera.
+fits the surface best: a pinhole has its centre elsewhere than the camera.
+
+Tolerances are for a metre: they grow with the distance from the nearest camera.
 *Off / sd*: median distance from the surface over the deviation that the cloud gives
 each point, of what normal errors would have: one where it is right, less where sights
 meet the surface at a slant.
