@@ -9,7 +9,7 @@ variance to a third, and sigma itself to some per cent.
 import numpy as np
 
 from uwsfm import Scene
-from uwsfm.calibration.problem import Covariance
+from uwsfm.calibration.result import Covariance
 from uwsfm.calibration.uncertainty import predict_covariance
 
 LEAST, MOST = 0.9, 1.6

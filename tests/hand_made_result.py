@@ -7,8 +7,8 @@ import numpy as np
 from sfm_scenes import model_of
 
 from uwsfm.calibration.lengths import LengthFit, PositionFit
-from uwsfm.calibration.problem import (
-    CalibrateOptions,
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import (
     CalibrateSummary,
     CalibrationResult,
     CameraCovariance,

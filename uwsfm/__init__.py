@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from uwsfm.calibration.lengths import Distances, Lengths, Positions
     from uwsfm.calibration.observability import verdicts
     from uwsfm.calibration.perspective import perspective_adjustment
-    from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+    from uwsfm.calibration.problem import CalibrateOptions
+    from uwsfm.calibration.result import CalibrationResult
     from uwsfm.calibration.uncertainty import predict_covariance
     from uwsfm.cloud import Cloud, read_cloud, write_cloud
     from uwsfm.colmap.model import Model
@@ -68,7 +69,7 @@ logger.addHandler(logging.NullHandler())
 _HOMES = {
     "CalibrateHousingOptions": "uwsfm.options.jobs",
     "CalibrateOptions": "uwsfm.calibration.problem",
-    "CalibrationResult": "uwsfm.calibration.problem",
+    "CalibrationResult": "uwsfm.calibration.result",
     "Cloud": "uwsfm.cloud",
     "DomePort": "uwsfm.models.ports.port",
     "Distances": "uwsfm.calibration.lengths",

@@ -24,7 +24,7 @@ from tables import Row, column, select
 import uwsfm
 from uwsfm._base.tasks import Workers
 from uwsfm.calibration.perspective import perspective_adjustment
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 import uwsfm
 from uwsfm._base.signals import BEGINS_AGAIN
 from uwsfm._base.tasks import Workers
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.cli.console import ProgressBars
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array

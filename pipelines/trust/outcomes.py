@@ -15,8 +15,8 @@ from assessment import assessed, with_deviations
 from dives import Dive, ImageKey
 from scipy.spatial.distance import pdist
 
-from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.propagation import Propagation
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import ExplainedInputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import uwsfm
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.cli.console import ProgressBars
 from uwsfm.scene import IndexArray
 from uwsfm.trust.halves import adjusted_alone

@@ -13,11 +13,8 @@ import numpy as np
 
 from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.problem import (
-    CalibrateOptions,
-    CalibrateSummary,
-    CalibrationResult,
-)
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import CalibrateSummary, CalibrationResult
 from uwsfm.calibration.scaling import moved
 from uwsfm.calibration.solves import MIN_SIGMA_PX, Run, Solved
 from uwsfm.calibration.uncertainty import posterior_covariance

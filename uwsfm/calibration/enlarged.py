@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwsfm.calibration.problem import (
+from uwsfm.calibration.result import (
     CalibrationResult,
     CameraCovariance,
     Covariance,

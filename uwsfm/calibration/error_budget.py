@@ -15,7 +15,7 @@ from uwsfm.calibration.given_errors import (
     with_given_errors,
 )
 from uwsfm.calibration.given_items import GivenItem, given_items
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS

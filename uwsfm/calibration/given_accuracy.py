@@ -248,7 +248,7 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
         )
     radial = {slot for chain in _radial(camera) for slot in chain}
     for k, slot in enumerate(coefficients):
-        reach = _corner_shift(camera, slot)
+        reach = corner_shift(camera, slot)
         # A number that moves nothing, as beta of EUCM with alpha zero, is known.
         radially = CORNER / reach if reach > 0.0 else 0.0
         default = radially if slot in radial else TANGENTIAL
@@ -263,7 +263,7 @@ def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> No
         _set(stddevs, assumed, first + slot, value, default)
 
 
-def _corner_shift(camera: GivenCamera, slot: int) -> float:
+def corner_shift(camera: GivenCamera, slot: int) -> float:
     """How far one unit of a coefficient moves the image corner, as a share of its
     distance from the centre."""
     if _radial(camera) is _SHAPE:
@@ -284,45 +284,6 @@ def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
     jac = np.empty((2, NUM_PARAMS))
     jac_by_params(x / z, 0.0, lens, jac)
     return float(abs(jac[0, slot])) / corner
-
-
-@dataclass(frozen=True, kw_only=True)
-class NamedUnit:
-    """The unit of a parameter in a covariance, beside that of a single accuracy."""
-
-    unit: str
-    """In the covariance: "px", "rad", "m", or "" for coefficients."""
-    key: str
-    """Of the accuracy that a person would state for it."""
-    factor: float
-    """How much one ``unit`` is in the unit of ``key``; of "distortion": the share by
-    which it moves the image corner."""
-
-
-def named_unit(cameras: Sequence[GivenCamera], name: str) -> NamedUnit:
-    """What a standard deviation of a covariance's parameter compares with.
-
-    A translation turns the baseline, or makes it longer by as much.
-
-    Args:
-        cameras: in the rig's order.
-        name: CAMERA.PARAMETER, one of those that `given_accuracy` takes.
-    """
-    camera_name, _, parameter = name.rpartition(".")
-    camera = next(one for one in cameras if one.name == camera_name)
-    if parameter.startswith("rotation_"):
-        factor = float(np.degrees(1.0))
-        return NamedUnit(unit="rad", key="rotation_deg", factor=factor)
-    if parameter.startswith("translation_"):
-        factor = float(np.degrees(1.0) / np.linalg.norm(camera.translation))
-        return NamedUnit(unit="m", key="direction_deg", factor=factor)
-    slot = camera.slots[camera.param_names.index(parameter)]
-    if slot < 2:
-        return NamedUnit(unit="px", key="focal", factor=1.0 / float(camera.lens[slot]))
-    if slot < 4:
-        return NamedUnit(unit="px", key="principal_point_px", factor=1.0)
-    factor = _corner_shift(camera, slot)
-    return NamedUnit(unit="", key="distortion", factor=factor)
 
 
 def _port(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> None:

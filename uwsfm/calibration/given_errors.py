@@ -18,12 +18,8 @@ from uwsfm.calibration.given_accuracy import (
     given_accuracy,
 )
 from uwsfm.calibration.priors import lens_priors
-from uwsfm.calibration.problem import (
-    CalibrationResult,
-    CameraCovariance,
-    InAll,
-)
 from uwsfm.calibration.relinearized import reopened
+from uwsfm.calibration.result import CalibrationResult, CameraCovariance, InAll
 from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.calibration.uncertainty import (
     Optimum,

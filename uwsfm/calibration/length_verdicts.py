@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from uwsfm.calibration.lengths import LengthFit, PositionFit
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 
 ARBITRARY = "arbitrary"
 ASK_FOR_LENGTH = (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.length_verdicts import length_verdicts, small_length
-from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.problem import CalibrateSummary
+from uwsfm.calibration.result import CalibrateSummary
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 
 from uwsfm.calibration.clicks import pixels_by_point
 from uwsfm.calibration.given_errors import given_reach
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import (
     clusters_of,
     likelihood,

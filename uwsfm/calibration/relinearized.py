@@ -7,7 +7,7 @@ import numpy as np
 from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.priors import border_priors, with_terms
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.solves import MIN_SIGMA_PX
 from uwsfm.calibration.uncertainty import Optimum
 from uwsfm.geometry import rigid3

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.priors import border_priors, with_terms
-from uwsfm.calibration.problem import CalibrateOptions, SolveHistory
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import SolveHistory
 from uwsfm.calibration.strategies import STRATEGIES
 from uwsfm.calibration.uncertainty import Optimum, held_length_stddev
 from uwsfm.errors import InputError, UwsfmError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.ports.port import FlatPort

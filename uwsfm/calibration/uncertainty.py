@@ -10,7 +10,8 @@ from uwsfm._base.indices import distinct, renumbered
 from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.priors import border_priors, with_terms
-from uwsfm.calibration.problem import CalibrateOptions, CameraCovariance, Covariance
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import CameraCovariance, Covariance
 from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from uwsfm._base.checksums import check_checksums
 from uwsfm._base.disk import require_room
-from uwsfm.colmap.files import check_model_files, has_files, stray_track
+from uwsfm.colmap.files import check_model_files, has_files
+from uwsfm.colmap.text_files import stray_track
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array

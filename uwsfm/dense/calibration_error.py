@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import RegularGridInterpolator
 
-from uwsfm.calibration.problem import Covariance
+from uwsfm.calibration.result import Covariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import closest_points
 from uwsfm.geometry.rigid3 import Array

@@ -12,7 +12,8 @@ from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.error_budget import BudgetRow
 from uwsfm.calibration.perspective import perspective_adjustment
-from uwsfm.calibration.problem import CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import InputError
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import at_scene_distance, checked_rig, require_effect

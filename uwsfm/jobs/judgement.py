@@ -8,7 +8,7 @@ from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.error_budget import ALIKE, BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.models.ports.port import NoPort
 from uwsfm.results.halves_summary import KEY, halves_numbers
 from uwsfm.results.summary import budget_summary

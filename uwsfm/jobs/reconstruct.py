@@ -9,7 +9,7 @@ import numpy as np
 
 from uwsfm._base.progress import Progress, silent
 from uwsfm._base.tasks import Workers
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.colmap.model import Model
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import at_scene_distance, checked_rig, require_effect

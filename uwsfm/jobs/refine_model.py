@@ -10,12 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._base.progress import Progress, silent
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import checked_rig, require_effect, scene_distance
 from uwsfm.jobs.judgement import judged_result
+from uwsfm.jobs.model_inputs import (
+    check_images,
+    found_model,
+    image_paths,
+    is_result,
+    same_or_inside,
+)
 from uwsfm.jobs.output_folder import (
     locked,
     made_of_files,
@@ -41,7 +48,6 @@ from uwsfm.results.summary import (
 )
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
-from uwsfm.sfm.from_colmap.colmap_model import FoundModel, find_model
 from uwsfm.sfm.from_colmap.model_database import (
     ImageDatabase,
     read_image_database,
@@ -49,7 +55,6 @@ from uwsfm.sfm.from_colmap.model_database import (
 )
 from uwsfm.sfm.from_colmap.model_start import ModelStart, Tracks, start_from_model
 from uwsfm.sfm.frontend.colors import point_colors
-from uwsfm.sfm.frontend.pixels import image_fault
 from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.refine import Refined, rig_options, without_empty_frames
 from uwsfm.trust.diagnosis import explain
@@ -152,15 +157,15 @@ def _inputs(
     """The model, its database and the known lengths, read and checked."""
     known = options.constraints
     distance_m = scene_distance(rig, known.scene_distance_m)
-    model = _found(source)
-    if out.exists() and _same_or_inside(model.folder, out / SPARSE):
+    model = found_model(source)
+    if out.exists() and same_or_inside(model.folder, out / SPARSE):
         raise InputError(
             f"{out / SPARSE} holds the model that is to be refined, which the result "
             "would replace: choose another folder"
         )
     start = start_from_model(model, rig, distance_m, options.database)
     if options.images is not None:
-        _check_images(options.images, rig, start)
+        check_images(options.images, rig, start)
     matches = None
     if options.database is not None:
         matches = read_image_database(options.database, start.model, rig)
@@ -168,47 +173,6 @@ def _inputs(
     names = start.model.frame_names if matches is None else matches.frame_names
     lengths.check_names(rig, names)
     return start, matches, lengths
-
-
-def _found(source: Path) -> FoundModel:
-    if not source.is_dir():
-        what = "is not a folder" if source.exists() else "does not exist"
-        raise InputError(f"COLMAP model {source} {what}")
-    found = find_model(source)
-    if found is None:
-        raise InputError(
-            f"{source} holds no COLMAP model: neither cameras.bin nor cameras.txt is "
-            "in it, in its folder sparse or in a numbered folder of these"
-        )
-    return found
-
-
-def _is_result(model: Path) -> bool:
-    """Whether a COLMAP model is that of a result folder, whose ports lie beside it."""
-    beside = (HOUSING, POINTS)
-    return model.name == SPARSE and all((model.parent / n).is_file() for n in beside)
-
-
-def _same_or_inside(folder: Path, parent: Path) -> bool:
-    return folder.resolve().is_relative_to(parent.resolve())
-
-
-def _image_paths(images: Path, rig: Rig, names: Sequence[str]) -> list[list[Path]]:
-    """[camera][frame]"""
-    return [[images / camera.images / n for n in names] for camera in rig.cameras]
-
-
-def _check_images(images: Path, rig: Rig, start: ModelStart) -> None:
-    """The images of the model are there, and the first of each camera has its size."""
-    paths = _image_paths(images, rig, start.model.frame_names)
-    for c, item in enumerate(rig.cameras):
-        there = [paths[c][f] for f in np.flatnonzero(start.model.registered[c])]
-        for path in there:
-            if not path.is_file():
-                raise InputError(f"image {path} of the model does not exist")
-        fault = image_fault(there[0], (item.camera.width, item.camera.height))
-        if fault is not None:
-            raise InputError(fault)
 
 
 @dataclass(frozen=True)
@@ -340,7 +304,7 @@ class _Job:
     ) -> NDArray[np.uint8]:
         """RGB (P, 3) from the images, or else from the model."""
         if self.options.images is not None:
-            paths = _image_paths(self.options.images, self.rig, names)
+            paths = image_paths(self.options.images, self.rig, names)
             return point_colors(scene, paths, self.progress)
         found = self.start.model
         colors = np.zeros((scene.num_points, 3), dtype=np.uint8)
@@ -371,7 +335,7 @@ class _Job:
         both = model_idx >= 0
         own = _mean(self.start.model.own_error_px[model_idx[both]])
         source, theirs = self.start.model.folder, dict(self.start.summary)
-        if _is_result(source):
+        if is_result(source):
             own = theirs["median_error_px"] = None
             notes.append(
                 f"{source} is a result of uwsfm, refractive already: its lenses lack "

@@ -9,7 +9,7 @@ from typing import Any
 from uwsfm._base.files import replaced_dir, replaced_file
 from uwsfm._base.progress import Progress, silent
 from uwsfm._base.signals import interruption_in
-from uwsfm.calibration.problem import CalibrationResult, Covariance
+from uwsfm.calibration.result import CalibrationResult, Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError
 from uwsfm.report.gather import FOLDER, NUMBERS, PAGE, gather, numbers_of

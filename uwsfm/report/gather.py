@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.calibration.problem import Covariance
+from uwsfm.calibration.result import Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.report.left_files import left_files
 from uwsfm.report.tables import Estimate, Frame, estimates, frames

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._base.indices import distinct
-from uwsfm.calibration.problem import Covariance
+from uwsfm.calibration.result import Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.problem import Covariance
+from uwsfm.calibration.result import Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.errors import UwsfmError
 from uwsfm.export.scene_ply import camera_lines

@@ -30,8 +30,8 @@ from uwsfm.calibration.lengths import (
     PositionFit,
     Positions,
 )
-from uwsfm.calibration.problem import (
-    CalibrateOptions,
+from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.result import (
     CalibrateSummary,
     CalibrationResult,
     CameraCovariance,

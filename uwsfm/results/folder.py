@@ -8,7 +8,7 @@ from typing import Any
 from uwsfm._base.checksums import write_checksums
 from uwsfm._base.files import read_json
 from uwsfm.calibration.enlarged import enlarged
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError
 from uwsfm.results.calibration_file import (

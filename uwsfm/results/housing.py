@@ -8,7 +8,7 @@ from typing import Any
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.named_covariance import without_names
 from uwsfm.calibration.observability import center_verdict, distance_verdict
-from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
+from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.results.verdict_summary import shown_word
 from uwsfm.rig.file import dump_rig

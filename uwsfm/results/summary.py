@@ -21,8 +21,8 @@ from uwsfm.calibration.observability import (
     distance_verdict,
     normal_verdict,
 )
-from uwsfm.calibration.problem import CalibrationResult, CameraCovariance
 from uwsfm.calibration.relinearized import reopened
+from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.models.lens import param_slots

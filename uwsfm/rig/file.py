@@ -107,7 +107,8 @@ def _check_accuracy(rig: Rig) -> None:
 
 def _check_covariance(rig: Rig) -> None:
     """Refuse standard deviations that no single accuracy may have."""
-    from uwsfm.calibration.given_accuracy import MAX_CORNER, named_unit
+    from uwsfm.calibration.given_accuracy import MAX_CORNER
+    from uwsfm.calibration.named_unit import named_unit
 
     named = rig.accuracy.covariance
     if named is None or IMPLAUSIBLE_ALLOWED.get():

@@ -10,7 +10,7 @@ from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.clicks import check_clicks, with_click_noise
 from uwsfm.calibration.lengths import Lengths
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.scaling import scaled, start_scale
 from uwsfm.errors import UwsfmError
 from uwsfm.rig.rig import Rig

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import UwsfmError
 from uwsfm.models.ports.port import FlatPort, Port
 from uwsfm.scene import Scene

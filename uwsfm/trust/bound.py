@@ -5,7 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.problem import PRIORS, CalibrationResult
+from uwsfm.calibration.problem import PRIORS
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.models.ports.port import FlatPort
 from uwsfm.scene import Scene
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from uwsfm._base.progress import Progress, silent
-from uwsfm.calibration.problem import PRIORS, CalibrateOptions, CalibrationResult
+from uwsfm.calibration.problem import PRIORS, CalibrateOptions
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene

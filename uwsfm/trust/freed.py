@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import BROWN, KIND, NUM_PARAMS, PINHOLE
 from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.rig.rig import Rig

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.calibration.problem import CalibrationResult
 from uwsfm.calibration.propagation import Propagation
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.rays import finite_rows

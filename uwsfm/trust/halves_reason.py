@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.trust.halves import (
     MIN_FRAMES,
     CrossValidation,

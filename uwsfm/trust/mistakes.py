@@ -1,8 +1,6 @@
 """Each mistake that people make, undone: a rig and observations to try.
 
-Those of the rig file alone are in `uwsfm.sfm.rig_checks.rig_mistakes`, where refusals
-find them; here are the others: what is wrong with the images, and numbers that are set
-free.
+Mistakes of the rig file alone are in `uwsfm.sfm.rig_checks.rig_mistakes`.
 """
 
 from __future__ import annotations

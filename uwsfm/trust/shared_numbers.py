@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwsfm.calibration.given_errors import GivenReach, given_reach
-from uwsfm.calibration.problem import CalibrationResult
+from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array

@@ -22,7 +22,7 @@ from uwsfm.trust.goodness import Goodness, Used, goodness_of
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, Severity, reason
 
 if TYPE_CHECKING:
-    from uwsfm.calibration.problem import CalibrationResult
+    from uwsfm.calibration.result import CalibrationResult
     from uwsfm.rig.rig import Rig
     from uwsfm.sfm.refine import Refined
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from uwsfm.errors import InputError
@@ -43,6 +42,7 @@ from uwsfm.sfm.poses.relative_pose_start import (
     central_poses,
     distinct_ends,
     image_pairs,
+    ransac_options,
 )
 from uwsfm.sfm.poses.rig_pose_kernel import covariance_from_hessian
 from uwsfm.solver.losses import LOSS_CODES
@@ -172,7 +172,7 @@ def estimate_rig_relative_poses(
     usable = finite_rows(rays_a) & finite_rows(rays_b)
     ends: list[tuple[float, Array]] = []
     for rows, a, b in image_pairs(index_a, index_b, usable):
-        ransac = _ransac_options(options, (cameras[a], cameras[b]))
+        ransac = ransac_options(options, (cameras[a], cameras[b]))
         for moved in central_poses(near_a[rows], near_b[rows], ransac):
             line = MotionLine.through(
                 moved, poses[a], poses[b], centres_a[a], centres_b[b]
@@ -184,20 +184,6 @@ def estimate_rig_relative_poses(
         _refined(pose, matches, usable, rig, options) for pose in distinct_ends(ends)
     )
     return [motion for motion in motions if motion is not None]
-
-
-def _ransac_options(
-    options: RelativePoseOptions, pair: tuple[RefractiveCamera, RefractiveCamera]
-) -> pycolmap.RANSACOptions:
-    """For directions in the water, whose pixels are smaller than in air."""
-    focals = [camera.port.n_water * np.mean(camera.lens[:2]) for camera in pair]
-    return pycolmap.RANSACOptions(
-        max_error=options.max_central_error_px / float(np.mean(focals)),
-        confidence=options.confidence,
-        min_num_trials=options.min_trials,
-        max_num_trials=options.max_trials,
-        random_seed=options.seed,
-    )
 
 
 def _lengths(

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.poses.kernel_rows import IndexArray
+from uwsfm.sfm.poses.relative_pose_options import RelativePoseOptions
 
 Mask = NDArray[np.bool_]
 
@@ -149,3 +151,17 @@ class MotionLine:
         """A row (12,) of [R | t]."""
         shift = self.offset + length * self.direction
         return rigid3.matrix_rows(np.concatenate([self.quat, shift]))
+
+
+def ransac_options(
+    options: RelativePoseOptions, pair: tuple[RefractiveCamera, RefractiveCamera]
+) -> pycolmap.RANSACOptions:
+    """For directions in the water, whose pixels are smaller than in air."""
+    focals = [camera.port.n_water * np.mean(camera.lens[:2]) for camera in pair]
+    return pycolmap.RANSACOptions(
+        max_error=options.max_central_error_px / float(np.mean(focals)),
+        confidence=options.confidence,
+        min_num_trials=options.min_trials,
+        max_num_trials=options.max_trials,
+        random_seed=options.seed,
+    )
