@@ -9,6 +9,7 @@ centres place a cloud on the truth, with a scale, and from there it moves to whe
 fits the surface best: a pinhole has its centre elsewhere than the camera.
 
 Tolerances are for a metre: they grow with the distance from the nearest camera.
+Pictures of the clouds from above, beside each other, go into OUT.
 *Off / sd*: median distance from the surface over the deviation that the cloud gives
 each point, of what normal errors would have: one where it is right, less where sights
 meet the surface at a slant.
@@ -48,6 +49,8 @@ from uwsfm.simulate.sequence import (
 
 TOLERANCES_MM = (1.0, 2.0, 5.0)
 """At a metre from the nearest camera."""
+CELL_M = 0.006
+"""Of the picture."""
 NUM_FITTED, FIT_ROUNDS = 20_000, 30
 NORMAL_MEDIAN = 0.6745
 """Of the absolute value of a normal variable, in standard deviations."""
@@ -276,6 +279,42 @@ def results(out: Path, only: str) -> Iterator[tuple[str, SequenceSpec, Path, Pat
             yield f"{name}{suffix}", spec, result, folder / "images"
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A cloud in the world of the truth, for the picture."""
+
+    label: str
+    points: Array
+    colors: NDArray[np.uint8]
+
+    def from_above(self, low: Array, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Its highest points in cells; white where there is none."""
+        image = np.full((size[1], size[0], 3), 255, dtype=np.uint8)
+        order = np.argsort(-self.points[:, 2], kind="stable")  # z points down
+        cell = np.floor((self.points[order, :2] - low) / CELL_M).astype(np.int64)
+        inside = np.all((cell >= 0) & (cell < size), axis=1)
+        x, y = cell[inside].T
+        image[y, x] = self.colors[order][inside]
+        return image
+
+
+def picture(shown: list[Shown], surface: Surface, path: Path) -> None:
+    """Clouds beside each other, from above."""
+    import matplotlib.pyplot as plt
+
+    low, high = (np.percentile(surface.places[:, :2], q, axis=0) for q in (1, 99))
+    size = tuple(np.ceil((high - low) / CELL_M).astype(int).tolist())
+    width = 3.4 * len(shown)
+    figure, axes = plt.subplots(1, len(shown), figsize=(width, 3.8), squeeze=False)
+    for axis, cloud in zip(axes[0], shown, strict=True):
+        axis.imshow(cloud.from_above(low, size))
+        axis.set_title(f"{cloud.label}\n{len(cloud.points):,} points", fontsize=9)
+        axis.axis("off")
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -293,19 +332,21 @@ def main() -> None:
     rows = []
     for name, spec, result, images in results(options.out, options.only):
         surface = surface_of(spec, 1 if name.endswith(ONE) else 2)
-        centers = model_centers(uwsfm.read_model(result))
+        centers, shown = model_centers(uwsfm.read_model(result)), []
         for matcher in MATCHERS[1 if name.endswith(ONE) else 0 :]:
             cloud = dense(result, images, matcher=matcher)
             place = fitted(placement(centers, spec), cloud.points, surface)
             known = place.apply(cloud.points), place.scale * cloud.stddev
             rows.append(scored(*known, surface).row(name, f"uwsfm, {matcher}"))
+            shown.append(Shown(f"uwsfm, {matcher}", known[0], cloud.colors))
         for label, scene, path, sparse in options.also:
             if scene == name:
-                other = uwsfm.read_cloud(path).points
+                other = uwsfm.read_cloud(path)
                 place = placement(colmap_centers(Path(sparse)), spec)
-                place = fitted(place, other, surface)
-                points = place.apply(other)
+                points = fitted(place, other.points, surface).apply(other.points)
                 rows.append(scored(points, None, surface).row(name, label))
+                shown.append(Shown(label, points, other.colors))
+        picture(shown, surface, options.out / f"{name.replace(' ', '_')}_clouds.png")
     head = [f"accuracy | completeness | F1 at {t:g} mm" for t in TOLERANCES_MM]
     print(f"| scene | cloud of | points | {' | '.join(head)} | off / sd |")
     print("|---" * (4 + 3 * len(TOLERANCES_MM)) + "|")
