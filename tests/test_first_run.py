@@ -35,7 +35,7 @@ LEFT = """
 import sys
 from pathlib import Path
 import uwsfm
-from uwsfm import first_run
+from uwsfm.jobs import compile_kernels as first_run
 from uwsfm._base.jit import CACHE_DIR
 from uwsfm.jobs.demo import sample_dir
 
@@ -134,9 +134,9 @@ def test_the_first_run_leaves_nothing_to_compile(tmp_path):
 # What an installed command does first, from the folder of its script.
 INSTALLED = """
 from uwsfm.jobs.compile_kernels import compile_kernels
-from uwsfm import _jit
+from uwsfm._base import jit
 assert compile_kernels(2) > 1.0
-print(_jit.__file__, _jit.CACHE_DIR)
+print(jit.__file__, jit.CACHE_DIR)
 """
 
 

@@ -165,7 +165,7 @@ def test_where_no_scheduler_is_nothing_is_written(
 
 STOPPED = """
 import psutil, time
-from uwsfm import cli
+from uwsfm.cli import app as cli
 
 @cli.app.command()
 def wait():
