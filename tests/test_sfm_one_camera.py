@@ -10,7 +10,7 @@ from test_sfm_mapping import center_errors
 
 from uwsfm import DomePort, InputError, calibrate
 from uwsfm.geometry import rigid3
-from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.jobs.finish import start_scene
 from uwsfm.rig.rig import Rig
 from uwsfm.sfm.options import StartOptions
 from uwsfm.sfm.pinhole.perspective import StartArrays, read_start

@@ -15,7 +15,7 @@ from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
 from uwsfm.geometry.joint_alignment import Link, align_jointly
-from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.jobs.finish import start_scene
 from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.options import MappingOptions, StartOptions

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from hand_made_result import bars, result_of, small_model
 
-from uwsfm.jobs.reconstruct import _images_without_points, _summary, refined_rig
+from uwsfm.jobs.finish import refined_rig
+from uwsfm.jobs.reconstruct import _images_without_points, _summary
 from uwsfm.sfm.frontend.images import Frames
 from uwsfm.sfm.mapping.refractive_start import RefractiveStart
 from uwsfm.sfm.refine import Refined

@@ -17,7 +17,7 @@ import pycolmap
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
-from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.jobs.finish import start_scene
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.options import Mapper, StartOptions

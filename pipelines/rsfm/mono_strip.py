@@ -23,7 +23,7 @@ from strips import OVERLAP
 import uwsfm
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.alignment import align
-from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.jobs.finish import start_scene
 from uwsfm.rig.rig import Rig
 from uwsfm.sfm.frontend.background import opened
 from uwsfm.sfm.options import StartOptions

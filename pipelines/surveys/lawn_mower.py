@@ -22,7 +22,7 @@ from comparison import RESULT, RUNS, compared, page
 
 from uwsfm._base.files import replaced_file
 from uwsfm._base.tasks import LOCAL
-from uwsfm.jobs.reconstruct import start_scene
+from uwsfm.jobs.finish import start_scene
 from uwsfm.rig.rig import Rig
 from uwsfm.sfm.options import MappingOptions, StartOptions
 from uwsfm.sfm.refine import refine_scene

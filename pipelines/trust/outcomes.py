@@ -22,7 +22,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between
-from uwsfm.jobs.reconstruct import refined_rig, start_scene
+from uwsfm.jobs.finish import refined_rig, start_scene
 from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.results.summary import housing_summary, scale_summary
 from uwsfm.rig.file import dump_rig, load_rig

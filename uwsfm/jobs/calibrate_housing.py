@@ -17,6 +17,7 @@ from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import InputError
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import at_scene_distance, checked_rig, require_effect
+from uwsfm.jobs.finish import compiled, refined_rig, start_scene
 from uwsfm.jobs.judgement import Judgement, judged_result
 from uwsfm.jobs.output_folder import (
     WORK,
@@ -25,7 +26,6 @@ from uwsfm.jobs.output_folder import (
     output_folder,
     require_elsewhere,
 )
-from uwsfm.jobs.reconstruct import compiled, refined_rig, start_scene
 from uwsfm.options.file import OPTIONS, write_options
 from uwsfm.options.jobs import CalibrateHousingOptions
 from uwsfm.report.command import command_line
@@ -49,7 +49,6 @@ from uwsfm.sfm.rig_checks.stereo_scene import same_frame_scene, without_wrong_ma
 from uwsfm.sfm.start import match_images, perspective_start
 from uwsfm.sfm.steps import Steps
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
@@ -309,14 +308,8 @@ class _Job:
         }
         summary = judged.added_to(summary, rig)
         if self.options.start != "pairs":  # which hold what most mistakes show in
-            causes = explain(
-                judged.word,
-                judged.verdict.codes,
-                self.rig,
-                calibration,
-                progress=self.progress,
-            )
-            summary["explanations"] = [one.to_json() for one in causes]
+            causes = judged.causes(self.rig, progress=self.progress)
+            summary["explanations"] = causes
         export_housing(rig, self.out / HOUSING, calibration, verdict=judged.word)
         write_options(self.options, self.out / OPTIONS)
         write_json(summary, self.out / HOUSING_SUMMARY)

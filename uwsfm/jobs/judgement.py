@@ -14,6 +14,7 @@ from uwsfm.results.halves_summary import KEY, halves_numbers
 from uwsfm.results.summary import budget_summary
 from uwsfm.results.verdict_summary import with_verdict
 from uwsfm.rig.rig import Rig
+from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.goodness import Used
 from uwsfm.trust.halves import CrossValidation, cross_validate_if_cheap
 from uwsfm.trust.halves_reason import (
@@ -60,6 +61,26 @@ class Judgement:
         if self.halves is not None:
             more[KEY] = halves_numbers(self.halves)
         return with_verdict(self.verdict, {**summary, **more})
+
+    def causes(
+        self,
+        rig: Rig,
+        frame_names: Sequence[str] | None = None,
+        progress: Progress = silent,
+    ) -> list[dict[str, Any]]:
+        """What explains an optimum that does not fit, for the summary.
+
+        Args:
+            rig: as given.
+            frame_names: of the calibration's frames, if they have names.
+            progress: called with each trial.
+        """
+        explained = explain(
+            *(self.word, self.verdict.codes, rig, self.calibration),
+            frame_names,
+            progress,
+        )
+        return [one.to_json() for one in explained]
 
 
 def judged_result(

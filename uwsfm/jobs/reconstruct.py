@@ -13,41 +13,27 @@ from uwsfm.calibration.result import CalibrationResult
 from uwsfm.colmap.model import Model
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import at_scene_distance, checked_rig, require_effect
-from uwsfm.jobs.compile_kernels import compile_kernels
+from uwsfm.jobs.finish import ModelJob, compiled, refined_rig, start_scene
 from uwsfm.jobs.judgement import judged_result
 from uwsfm.jobs.output_folder import WORK, locked, made_of_files, output_folder
-from uwsfm.options.file import OPTIONS, write_options
 from uwsfm.options.jobs import ReconstructOptions
 from uwsfm.report.command import command_line
-from uwsfm.report.files import write_with_report
-from uwsfm.results.files import (
-    HOUSING,
-    POINTS,
-    RIG_GIVEN,
-    SPARSE,
-    export_colmap,
-    export_ply,
-)
-from uwsfm.results.folder import recorded_images, store_calibration
-from uwsfm.results.housing import export_given_rig, export_housing
+from uwsfm.results.folder import recorded_images
 from uwsfm.results.log import job_log
 from uwsfm.results.summary import (
     errors_summary,
     housing_summary,
     outside_summary,
     refined_summary,
-    scale_summary,
     versions,
 )
 from uwsfm.rig.rig import Rig
-from uwsfm.scene import Scene
 from uwsfm.sfm.frontend.colors import stored_point_colors
 from uwsfm.sfm.frontend.images import find_frames
 from uwsfm.sfm.pinhole.perspective import StartArrays
 from uwsfm.sfm.refine import Refined, rig_options
 from uwsfm.sfm.start import Start, perspective_start
 from uwsfm.sfm.workspace import Workspace
-from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
 
@@ -128,18 +114,13 @@ def reconstruct(
         return result
 
 
-@dataclass(frozen=True)
-class _Job:
+@dataclass(frozen=True, kw_only=True)
+class _Job(ModelJob):
     """One reconstruction, its input and how it is to be done."""
 
-    rig: Rig
     images: Path
-    out: Path
     options: ReconstructOptions
     known: KnownLengths
-    command: str | None
-    made_of: dict[str, str | None]
-    progress: Progress
 
     def run(self) -> ReconstructResult:
         out, front_end = self.out, self.options.front_end
@@ -158,33 +139,11 @@ class _Job:
         timings["judging the fit"] = time.perf_counter() - clock
         clock, calibration = time.perf_counter(), judged.calibration
         model = _model(self.rig, arrays, refined, out / WORK)
-        export_colmap(model, out / SPARSE)
-        export_housing(model.rig, out / HOUSING, calibration, verdict=judged.word)
-        export_given_rig(self.rig, out / RIG_GIVEN)
-        write_options(self.options, out / OPTIONS)
-        export_points(model, out / POINTS, calibration)
-        store_calibration(judged.solved, out)
+        self.write(model, judged)
         timings["colours and export"] = time.perf_counter() - clock
         refined = replace(refined, calibration=calibration)
         summary = _summary(model, start, refined, timings, self.images)
-        summary["command"] = self.command
-        summary["made_of"] = self.made_of
-        summary = judged.added_to(summary, model.rig)
-        clock = time.perf_counter()
-        causes = explain(
-            judged.word,
-            judged.verdict.codes,
-            self.rig,
-            calibration,
-            model.frame_names,
-            self.progress,
-        )
-        summary["explanations"] = [one.to_json() for one in causes]
-        timings["looking for the cause"] = time.perf_counter() - clock
-        wanted = self.options.report
-        write_with_report(
-            out, model, calibration, summary, self.progress, wanted=wanted
-        )
+        summary = self.finish(model, judged, summary, timings)
         return ReconstructResult(
             model=model,
             calibration=calibration,
@@ -207,34 +166,6 @@ class _Job:
             lengths=lengths,
             **self.options.adjustment.as_fields(),
         )
-
-
-def compiled(num_threads: int, progress: Progress) -> dict[str, float]:
-    """What the first run costs, as a part of a summary's times; empty in all others."""
-    seconds = compile_kernels(num_threads, progress)
-    return {"compiling kernels": seconds} if seconds else {}
-
-
-def export_points(model: Model, path: Path, calibration: CalibrationResult) -> None:
-    """points.ply, with what is known of its lengths."""
-    unit = scale_summary(calibration)["unit"]
-    export_ply(model, path, calibration.covariance.points, unit=unit)
-
-
-def start_scene(rig: Rig, start: Start, arrays: StartArrays) -> Scene:
-    placement = start.cam_from_rig
-    if rig.cam_from_rig is not None and not rig.refine_cam_from_rig:
-        placement = rig.cam_from_rig
-    return Scene.from_arrays(
-        cameras=start.cameras(rig),
-        cam_from_rig=placement,
-        rig_from_world=arrays.rig_from_world,
-        points=arrays.points,
-        camera_idx=arrays.camera_idx,
-        frame_idx=arrays.frame_idx,
-        point_idx=arrays.point_idx,
-        xy=arrays.xy,
-    )
 
 
 def _model(rig: Rig, arrays: StartArrays, refined: Refined, work_dir: Path) -> Model:
@@ -301,11 +232,3 @@ def _images_without_points(model: Model) -> list[str]:
     return [
         f"{which}: is the scene in view, and were the images of a frame taken together?"
     ]
-
-
-def refined_rig(rig: Rig, scene: Scene) -> Rig:
-    """A rig with the poses, the ports and the lenses of a refined scene."""
-    found = rig.with_geometry(scene.cam_from_rig, scene.ports)
-    lenses: list[Any] = [camera.camera for camera in scene.cameras]
-    pairs = zip(found.cameras, lenses, strict=True)
-    return replace(found, cameras=tuple(replace(c, camera=lens) for c, lens in pairs))

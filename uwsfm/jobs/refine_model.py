@@ -15,6 +15,7 @@ from uwsfm.colmap.model import Model
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.inputs.known_lengths import KnownLengths
 from uwsfm.jobs.checks import checked_rig, require_effect, scene_distance
+from uwsfm.jobs.finish import ModelJob, compiled, refined_rig
 from uwsfm.jobs.judgement import judged_result
 from uwsfm.jobs.model_inputs import (
     check_images,
@@ -29,15 +30,11 @@ from uwsfm.jobs.output_folder import (
     output_folder,
     require_elsewhere,
 )
-from uwsfm.jobs.reconstruct import compiled, export_points, refined_rig
 from uwsfm.models.ports.port import FlatPort
-from uwsfm.options.file import OPTIONS, write_options
 from uwsfm.options.jobs import RefineOptions
 from uwsfm.report.command import command_line
-from uwsfm.report.files import write_with_report
-from uwsfm.results.files import HOUSING, POINTS, RIG_GIVEN, SPARSE, export_colmap
-from uwsfm.results.folder import recorded_images, store_calibration
-from uwsfm.results.housing import export_given_rig, export_housing
+from uwsfm.results.files import HOUSING, SPARSE
+from uwsfm.results.folder import recorded_images
 from uwsfm.results.log import job_log
 from uwsfm.results.summary import (
     errors_summary,
@@ -57,7 +54,6 @@ from uwsfm.sfm.from_colmap.model_start import ModelStart, Tracks, start_from_mod
 from uwsfm.sfm.frontend.colors import point_colors
 from uwsfm.sfm.options import thread_count
 from uwsfm.sfm.refine import Refined, rig_options, without_empty_frames
-from uwsfm.trust.diagnosis import explain
 from uwsfm.trust.refusal import refined_or_explained
 from uwsfm.trust.verdict import Verdict, used_of
 
@@ -175,19 +171,14 @@ def _inputs(
     return start, matches, lengths
 
 
-@dataclass(frozen=True)
-class _Job:
+@dataclass(frozen=True, kw_only=True)
+class _Job(ModelJob):
     """One refinement, its input and how it is to be done."""
 
-    rig: Rig
     start: ModelStart
     database: ImageDatabase | None
     lengths: KnownLengths
     options: RefineOptions
-    out: Path
-    command: str | None
-    made_of: dict[str, str | None]
-    progress: Progress
     timings: dict[str, float]
 
     def run(self) -> RefineResult:
@@ -207,38 +198,16 @@ class _Job:
         clock = time.perf_counter()
         model_idx = tracks.model_idx[refined.kept]
         model, refined = self._model(refined, tracks)
-        timing, judging = self.timings, time.perf_counter()
+        judging = time.perf_counter()
         used = used_of(refined, len(tracks.frame_names))
         judged = judged_result(self.rig, refined.calibration, used, self.progress)
-        timing["judging the fit"] = time.perf_counter() - judging
-        clock, calibration = clock + timing["judging the fit"], judged.calibration
-        export_colmap(model, self.out / SPARSE)
-        export_housing(model.rig, self.out / HOUSING, calibration, verdict=judged.word)
-        export_given_rig(self.rig, self.out / RIG_GIVEN)
-        write_options(self.options, self.out / OPTIONS)
-        export_points(model, self.out / POINTS, calibration)
-        store_calibration(judged.solved, self.out)
+        self.timings["judging the fit"] = time.perf_counter() - judging
+        clock, calibration = clock + self.timings["judging the fit"], judged.calibration
+        self.write(model, judged)
         self.timings["colours and export"] = time.perf_counter() - clock
         refined = replace(refined, calibration=calibration)
         summary = self._summary(model, refined, model_idx, tracks.frame_names)
-        summary["command"] = self.command
-        summary["made_of"] = self.made_of
-        summary = judged.added_to(summary, model.rig)
-        clock = time.perf_counter()
-        causes = explain(
-            judged.word,
-            judged.verdict.codes,
-            self.rig,
-            calibration,
-            model.frame_names,
-            self.progress,
-        )
-        summary["explanations"] = [one.to_json() for one in causes]
-        timing["looking for the cause"] = time.perf_counter() - clock
-        wanted = self.options.report
-        write_with_report(
-            self.out, model, calibration, summary, self.progress, wanted=wanted
-        )
+        summary = self.finish(model, judged, summary, self.timings)
         return RefineResult(
             model=model,
             calibration=calibration,
