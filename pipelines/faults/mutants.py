@@ -112,6 +112,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "sfm/refractive_steps.py": _STEPS,
         "dense/maps.py": ("test_stale_depth_maps.py",),
         "dense/stereo_maps.py": ("test_stale_depth_maps.py",),
+        "dense/reduced.py": ("test_stale_depth_maps.py",),
     },
 }
 """Modules of a kind, and the fast tests that concern each."""
@@ -126,6 +127,7 @@ ONLY = {
     "sfm/refractive_steps.py": ("map_refractively",),
     "dense/maps.py": ("_path", "read", "require_images"),
     "dense/stereo_maps.py": ("key", "name"),
+    "dense/reduced.py": ("content",),
 }
 """Functions of a module that make keys; what steps do has tests that take longer."""
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,22 +43,6 @@ def pixel_rows(camera: RefractiveCamera, first: int, last: int, step: int = 1) -
     x = np.arange(0, camera.width, step) + 0.5
     y = np.arange(first, last, step) + 0.5
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
-def sampled(plane: Plane, at: Plane, *, nearest: bool = False) -> Plane:
-    """Values (h, w) of a plane at places (h, w, 2), pixel centres at integers.
-
-    Bilinear, or of the nearest pixel; NaN outside and beside NaN.
-    """
-    found = cv2.remap(
-        plane,
-        at[..., 0],
-        at[..., 1],
-        cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=float("nan"),
-    )
-    return np.asarray(found)
 
 
 def write_depth_map(depth: DepthMap, path: Path, key: str) -> None:

@@ -11,9 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from uwsfm.colmap.model import Model
 from uwsfm.dense.depth_map import DepthMap, read_planes, write_planes
@@ -25,16 +23,14 @@ from uwsfm.dense.patchmatch_depth import (
     patchmatch_bytes,
 )
 from uwsfm.dense.reduced import Reduced
-from uwsfm.dense.views import View, cam_from_world, image_path
+from uwsfm.dense.views import View, cam_from_world
 from uwsfm.dense.warp import Placement
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.sfm.steps import fingerprint
 
-FORMAT = 3
+FORMAT = 4
 """Of the hypotheses and of what is made of them: others are made again."""
-
-
 KEPT_IMAGES = 16
 """Grey images in memory."""
 
@@ -64,21 +60,18 @@ class PatchMatchMaps:
         views: list[View],
         max_pixels: float,
     ) -> None:
-        self._model, self._images, self._work = model, images, work
+        self._model, self._work = model, work
         self._views = views
         self._reduced = Reduced(model, images, max_pixels)
         self.camera, self.factor = self._reduced.camera, self._reduced.factor
+        self.color = self._reduced.image
         # Neighbours are needed again and again, and large images take long to read.
-        self._gray = lru_cache(KEPT_IMAGES)(self._gray_of)
+        self._gray = lru_cache(KEPT_IMAGES)(self._reduced.gray)
         self._index = {(view.camera, view.frame): i for i, view in enumerate(views)}
 
     def name(self, view: View) -> str:
         """File of its depth map."""
         return f"{view.frame:06d}_{view.camera}-patchmatch.npz"
-
-    def color(self, camera: int, name: str) -> NDArray[Any]:
-        """An image (h, w, 3) as it is compared, blue, green, red."""
-        return self._reduced.image(camera, name)
 
     def facts(self, index: int) -> dict[str, Any]:
         """What the summary reports of rectified images: there are none."""
@@ -112,20 +105,9 @@ class PatchMatchMaps:
 
     def search_key(self, index: int) -> str:
         """Of all that the first pass depends on."""
-        view, scene = self._views[index], self._model.scene
-        cameras = sorted({view.camera, *(camera for camera, _ in view.others)})
-        lenses = [
-            (scene.cameras[c].lens.tolist(), scene.cameras[c].port.row.tolist())
-            for c in cameras
-        ]
-        files = []
-        for name in (view.name, *view.other_names):
-            status = image_path(self._images, name).stat()
-            files.append((name, status.st_size, status.st_mtime_ns))
+        view = self._views[index]
         poses = [pose.tolist() for pose in self._poses(view)]
-        factors = [self.factor(c) for c in cameras]
-        limits = view.near, view.far
-        return fingerprint([FORMAT, lenses, files, poses, factors, limits])
+        return fingerprint([FORMAT, self._reduced.content(view), poses])
 
     def bytes_of(self, index: int) -> float:
         """What a pass needs of a view."""
@@ -159,9 +141,6 @@ class PatchMatchMaps:
             (view.near, view.far),
             seed=index,
         )
-
-    def _gray_of(self, camera: int, name: str) -> NDArray[Any]:
-        return cv2.cvtColor(self.color(camera, name), cv2.COLOR_BGR2GRAY)
 
     def _points(self, index: int) -> Array:
         """Where the view sees points of the model (N, 3): pixel and inverse depth."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.colmap.model import Model
-from uwsfm.dense.views import load_image
+from uwsfm.dense.views import View, image_path, load_image
 from uwsfm.models.refractive import RefractiveCamera
 
 
@@ -41,6 +41,28 @@ class Reduced:
         """A reduced image (h, w, 3), blue, green, red."""
         image = load_image(self._model, self._images, camera, name)
         return reduced_image(image, self.factor(camera))
+
+    def gray(self, camera: int, name: str) -> NDArray[Any]:
+        """The same in grey, (h, w)."""
+        return cv2.cvtColor(self.image(camera, name), cv2.COLOR_BGR2GRAY)
+
+    def content(self, view: View) -> list[Any]:
+        """What a depth map depends on besides the poses, for its key."""
+        scene = self._model.scene
+        used = sorted({view.camera, *(camera for camera, _ in view.others)})
+        cameras = [
+            (
+                scene.cameras[c].lens.tolist(),
+                scene.cameras[c].port.row.tolist(),
+                self.factor(c),
+            )
+            for c in used
+        ]
+        files = []
+        for name in (view.name, *view.other_names):
+            status = image_path(self._images, name).stat()
+            files.append((name, status.st_size, status.st_mtime_ns))
+        return [used, cameras, files, view.near, view.far]
 
 
 def reduced_camera(camera: RefractiveCamera, factor: int) -> RefractiveCamera:

@@ -108,6 +108,7 @@ class _Run:
         self.views = self.maps.views
         cores = os.cpu_count() or 1
         self.threads = cores if options.num_threads < 1 else options.num_threads
+        self.rule = Rule(min_views=options.min_views, keep_single=options.keep_single)
         self.seconds: dict[str, float] = {}
         self.plan = self._planned()
         self.store = _Store(self.maps.placed, self.plan.store_bytes)
@@ -340,9 +341,7 @@ class _Run:
             [self.store.get(i) for i in self.near[index]],
             self.color(index),
             noise,
-            Rule(
-                min_views=self.options.min_views, keep_single=self.options.keep_single
-            ),
+            self.rule,
             rows,
         )
 

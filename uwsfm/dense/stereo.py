@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows, sampled
+from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows
+from uwsfm.dense.lookup import sampled
 from uwsfm.dense.match import WINDOWS_PX, Gray, match_tiles, refine, smoothed
 from uwsfm.dense.rectify import Rectification
 from uwsfm.geometry import rigid3

@@ -5,17 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from uwsfm.colmap.model import Model
 from uwsfm.dense.depth_map import DepthMap
-from uwsfm.dense.match import COST_BYTES, MULTIPLE, Gray
+from uwsfm.dense.match import COST_BYTES, MULTIPLE
 from uwsfm.dense.rectify import Pair, Rectification, rectifications
 from uwsfm.dense.reduced import Reduced
 from uwsfm.dense.stereo import BYTES_PER_PIXEL, stereo_depth
-from uwsfm.dense.views import View, image_path, pair_of
+from uwsfm.dense.views import View, pair_of
 from uwsfm.sfm.steps import fingerprint
 
 FORMAT = 4
@@ -42,17 +38,14 @@ class StereoMaps:
     def __init__(
         self, model: Model, images: Path, views: list[View], max_pixels: float
     ) -> None:
-        self._model, self._images, self._views = model, images, views
+        self._model, self._views = model, views
         self._reduced = Reduced(model, images, max_pixels)
         self.camera, self.factor = self._reduced.camera, self._reduced.factor
+        self.color = self._reduced.image
 
     def name(self, view: View) -> str:
         """File of its depth map."""
         return f"{view.frame:06d}_{view.camera}-{view.others[0][0]}.npz"
-
-    def color(self, camera: int, name: str) -> NDArray[Any]:
-        """An image (h, w, 3) as it is compared, blue, green, red."""
-        return self._reduced.image(camera, name)
 
     def search(self, index: int) -> None:
         """There is no first pass."""
@@ -65,8 +58,8 @@ class StereoMaps:
             budget: bytes that may be allocated.
         """
         view = self._views[index]
-        left = self._gray(view.camera, view.name)
-        right = self._gray(view.others[0][0], view.other_names[0])
+        left = self._reduced.gray(view.camera, view.name)
+        right = self._reduced.gray(view.others[0][0], view.other_names[0])
         return stereo_depth(self._slabs(view), left, right, budget)
 
     def facts(self, index: int) -> dict[str, Any]:
@@ -79,21 +72,11 @@ class StereoMaps:
 
     def key(self, index: int) -> str:
         """Fingerprint of everything that a depth map depends on."""
-        view, scene = self._views[index], self._model.scene
-        pair = [view.camera, view.others[0][0]]
-        cameras = [
-            (scene.cameras[c].lens.tolist(), scene.cameras[c].port.row.tolist())
-            for c in pair
-        ]
-        files = []
-        for name in (view.name, *view.other_names):
-            status = image_path(self._images, name).stat()
-            files.append((name, status.st_size, status.st_mtime_ns))
+        view = self._views[index]
         # Of the rig, to the last digit, wherever the frame is.
-        poses = scene.cam_from_rig[pair].tolist()
-        factors = [self.factor(c) for c in pair]
-        limits = view.near, view.far
-        return fingerprint([FORMAT, cameras, files, poses, factors, limits])
+        pair = [view.camera, view.others[0][0]]
+        poses = self._model.scene.cam_from_rig[pair].tolist()
+        return fingerprint([FORMAT, self._reduced.content(view), poses])
 
     def bytes_of(self, index: int) -> float:
         """Bytes that `depth` needs, with the smallest tiles."""
@@ -113,6 +96,3 @@ class StereoMaps:
                 far=view.far,
             )
         )
-
-    def _gray(self, camera: int, name: str) -> Gray:
-        return np.asarray(cv2.cvtColor(self.color(camera, name), cv2.COLOR_BGR2GRAY))
