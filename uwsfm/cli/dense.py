@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from uwsfm.cli.options import ThreadsOption
+from uwsfm.cli.options import ImagesOption, ThreadsOption
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,13 +18,7 @@ def dense(
             metavar="OUT", help="The output of uwsfm reconstruct or uwsfm refine."
         ),
     ],
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder where the images are now. Default: where they were.",
-            show_default=False,
-        ),
-    ] = None,
+    images: ImagesOption = None,
     voxel: Annotated[
         float | None,
         typer.Option(

@@ -199,6 +199,13 @@ _SEED, _THREADS, _SCHEDULER, _MAPPER = (
     for name in ("seed", "num_threads", "scheduler", "mapper")
 )
 RigArgument = Annotated[Path, typer.Argument(help="The rig file, see uwsfm init.")]
+ImagesOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder where the images are now. Default: where they were.",
+        show_default=False,
+    ),
+]
 ResultsOption = Annotated[
     Path, typer.Option("--out", "-o", help="Folder that receives the results.")
 ]

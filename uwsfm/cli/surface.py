@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from uwsfm._base.signals import NOTHING_WRITTEN, interruptible
+from uwsfm.cli.options import ImagesOption
 
 SourceArgument = Annotated[
     Path,
@@ -130,13 +131,7 @@ def mesh(
     texture_side: Annotated[
         int, typer.Option(help="Largest side of the texture, in texels.")
     ] = 4096,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder where the photographs are now. Default: where they were.",
-            show_default=False,
-        ),
-    ] = None,
+    images: ImagesOption = None,
 ) -> None:
     """Write a surface through the points: PLY, OBJ, GLB and a small GLB for the web."""
     from rich.markup import escape
@@ -231,13 +226,7 @@ def color(
         Path, typer.Argument(metavar="OUT", help="The output of uwsfm reconstruct.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write.")],
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder where the images are now. Default: where they were.",
-            show_default=False,
-        ),
-    ] = None,
+    images: ImagesOption = None,
     write_images: Annotated[
         bool,
         typer.Option(
