@@ -14,7 +14,7 @@ import numpy as np
 from reef import Truth, reef_spec
 
 from uwsfm.dense import match
-from uwsfm.dense.depth_map import sampled
+from uwsfm.dense.lookup import sampled
 from uwsfm.dense.rectify import Pair, rectifications
 from uwsfm.dense.stereo import rectified_images
 from uwsfm.geometry import rigid3

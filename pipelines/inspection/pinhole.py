@@ -14,7 +14,8 @@ import numpy as np
 import pycolmap
 
 from uwsfm.calibration.bundle_adjustment import calibrate
-from uwsfm.dense.depth_map import pixel_rows, sampled
+from uwsfm.dense.depth_map import pixel_rows
+from uwsfm.dense.lookup import sampled
 from uwsfm.dense.match import match_tiles, num_disparities, refine
 from uwsfm.geometry import rigid3
 from uwsfm.models.ports.port import NoPort
