@@ -24,6 +24,7 @@ def random_cloud(rng: np.random.Generator, count: int) -> Cloud:
         stddev=rng.uniform(size=count),
         num_views=rng.integers(1, 9, count),
         view_range=rng.uniform(1.0, 3.0, count),
+        plain=rng.random(count) < 0.5,
     )
 
 

@@ -53,6 +53,7 @@ def test_colours_of_a_voxel_are_averaged_by_their_weights():
                 stddev=np.array([0.01]),
                 num_views=np.array([2]),
                 view_range=np.array([view_range]),
+                plain=np.array([False]),
                 color_weight=np.array([view_range**-2.0]),
             )
         )

@@ -113,6 +113,28 @@ def test_what_others_contradict_is_dropped(rng: np.random.Generator):
     assert len(nothing) == 0
 
 
+def test_a_point_is_plain_where_no_depth_map_has_it_by_texture(rng):
+    maps = maps_of_floor(rng, 3)
+    everywhere = np.ones(maps[0].distance.shape, dtype=bool)
+    left = np.zeros_like(everywhere)
+    left[:, :40] = True
+    image = np.zeros((60, 80, 3), dtype=np.uint8)
+    rule = Rule(min_views=3, keep_single=False)
+    plain = replace(maps[0], plain=everywhere)
+    others = [replace(maps[1], plain=left), replace(maps[2], plain=left)]
+    fused, _ = fuse(plain, others, image, NOISE_PX, rule)
+    expected = np.ones(len(fused), dtype=bool)
+    for other in maps[1:]:
+        in_cam = rigid3.transform(other.cam_from_world, fused.points)
+        xy, _ = other.camera.img_from_point(in_cam)
+        expected &= xy[:, 0] < 40.0
+    # Each lookup is of the nearest pixel: at the line itself either is right.
+    assert np.mean(fused.plain == expected) > 0.98
+    assert 0.2 < np.mean(expected) < 0.8
+    sure, _ = fuse(maps[0], others, image, NOISE_PX, rule)
+    assert not sure.plain.any()
+
+
 def test_colours_beside_a_step_and_from_aside_and_afar_count_little(rng):
     """A step of 30 cm in a floor: its pixels show the colours of both sides."""
     maps = maps_of_floor(rng, 4, bump=0.3)
@@ -159,6 +181,8 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         stddev=rng.uniform(0.001, 0.002, count),
         num_views=rng.integers(2, 9, count),
         view_range=rng.uniform(1.0, 2.0, count),
+        # Of some 60 in a voxel: in half of the voxels all.
+        plain=np.all(points - origin < [0.1, 0.1, 0.05], axis=1),
         color_weight=rng.uniform(0.1, 3.0, count),
     )
     voxels = Voxels(0.05, origin, 1e9)
@@ -180,6 +204,7 @@ def test_voxels_average_by_inverse_variance(rng: np.random.Generator):
         np.testing.assert_allclose(cloud.colors[i], color, rtol=0.0, atol=0.501)
         assert cloud.view_range[i] == np.float32(fused.view_range[rows].min())
         assert cloud.num_views[i] == fused.num_views[rows].max()
+        assert cloud.plain[i] == fused.plain[rows].all()
         # Neighbours share their errors: the mean's deviation is the mean deviation,
         # no smaller for being of many.
         expected = np.average(fused.stddev[rows], weights=weight)
@@ -199,6 +224,7 @@ def test_voxels_that_do_not_fit_become_larger(rng: np.random.Generator):
         stddev=np.full(count, 0.001),
         num_views=np.full(count, 3),
         view_range=np.full(count, 1.5),
+        plain=np.zeros(count, dtype=bool),
         color_weight=np.ones(count),
     )
     voxels = Voxels(0.001, np.zeros(3), 300.0 * BYTES_PER_VOXEL)

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from dense_scenes import Plane
 
 from uwsfm.dense.depth_map import pixel_rows
+from uwsfm.dense.options import ASSUMED_NOISE_PX
 from uwsfm.dense.patchmatch_depth import Neighbour, PatchMatch, depth_map_of
 from uwsfm.dense.reduced import reduced_camera, reduced_image
 from uwsfm.dense.warp import Placement
@@ -16,6 +18,7 @@ from uwsfm.simulate.rigs import sample_rig
 
 NORMAL = np.array([0.3, -0.25, 1.0]) / np.linalg.norm([0.3, -0.25, 1.0])
 PLANE = Plane(NORMAL, 1.7, 0.008)
+FINE = Plane(NORMAL, 1.7, 0.004)
 LIMITS = 1.2, 2.8
 NOTHING = np.empty((0, 3))
 INNER = np.s_[12:-12, 20:-20]
@@ -85,6 +88,64 @@ def test_a_neighbour_that_shows_something_else_is_left_out(case):
     depth = replace(case, neighbours=[spoilt, *case.neighbours]).depth()
     px = ((depth.ranges - case.truth()) / depth.sensitivity)[INNER]
     assert np.mean(np.abs(px) < 0.5) > 0.98
+
+
+def plain_disc(camera, pose, radius=0.25):
+    """An image of the plane with a disc that has one colour, and where it is."""
+    image = FINE.image(camera, pose).astype(np.float64)
+    back = rigid3.inverse(pose)
+    origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
+    origins, dirs = rigid3.transform(back, origins), rigid3.rotate(back, dirs)
+    points = origins + PLANE.ranges(origins, dirs)[:, None] * dirs
+    disc = np.hypot(points[:, 0] - 0.05, points[:, 1]).reshape(image.shape) < radius
+    image[disc] = 110.0
+    return noisy(image, 1.0, int(1e6 * abs(pose[4]))), disc
+
+
+def test_a_plain_area_is_filled_and_marked_and_known_less_well():
+    """A disc 80 pixels across without any texture but noise, its images searched
+    each for itself."""
+    camera = sample_rig(image_scale=0.4).refractive_cameras()[0]
+    moves = [(0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (-0.2, 0.05, 0.2), (0.1, 0.2, -0.1)]
+    poses = [np.array([0, 0, np.sin(t), np.cos(t), x, y, 0]) for x, y, t in moves]
+    images, discs = zip(*(plain_disc(camera, pose) for pose in poses), strict=True)
+
+    def made(index, planes):
+        back = rigid3.inverse(poses[index])
+        neighbours = [
+            Neighbour(
+                placement=Placement(
+                    camera=camera, from_reference=rigid3.compose(pose, back)
+                ),
+                image=image,
+                planes=known,
+            )
+            for i, (pose, image, known) in enumerate(
+                zip(poses, images, planes, strict=True)
+            )
+            if i != index
+        ]
+        return PatchMatch(camera, images[index], neighbours, LIMITS, index)
+
+    planes = [made(i, [None] * len(poses)).search(NOTHING) for i in range(len(poses))]
+    depth = depth_map_of(camera, *made(0, planes).settled(planes[0]))
+    origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
+    truth = PLANE.ranges(origins, dirs).reshape(depth.ranges.shape)
+    px = np.abs(depth.ranges - truth) / depth.sensitivity
+    disc = discs[0]
+    assert np.count_nonzero(disc) > 3000
+    # Without the planes less than half of it.
+    assert np.mean(np.isfinite(px[disc])) > 0.97
+    # A pixel is what they say; corners at its rim, which the planes go through, are
+    # known to 0.2 px.
+    assert np.nanmedian(px[disc]) < 0.3 and np.nanpercentile(px[disc], 95) < 1.0
+    # Beside its rim there is texture within the patch.
+    core = cv2.erode(disc.astype(np.uint8), np.ones((17, 17), np.uint8)) > 0
+    assert np.mean(depth.plain[core]) > 0.95
+    around = ~disc & np.isfinite(depth.ranges)
+    assert np.mean(depth.plain[around]) < 0.05
+    stddev = ASSUMED_NOISE_PX * depth.spread
+    assert np.median(stddev[core & depth.plain]) > 5.0 * np.nanmedian(stddev[~disc])
 
 
 def test_depths_that_neighbours_object_to_become_dear(case):

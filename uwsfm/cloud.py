@@ -19,6 +19,7 @@ _COLUMNS = (
     ("stddev", "<f4"),
     ("num_views", "<i4"),
     ("view_range", "<f4"),
+    ("plain", "u1"),
 )
 STDDEV_NAMES = ("stddev", "depth_stddev_m")
 """Properties that hold standard deviations along the line of sight: of dense clouds,
@@ -51,12 +52,18 @@ class Cloud:
     view_range: Array
     """(N,) distance from the camera that gives the colour, through the water, or the
     mean over the images of a point of an adjustment; NaN if unknown."""
+    plain: NDArray[np.bool_] | None = None
+    """(N,) where no image shows a depth by its texture, so that it is that of planes
+    through what is sure around the point. None, when made: nowhere."""
 
     def __post_init__(self) -> None:
+        if self.plain is None:
+            nowhere = np.zeros(len(self.points), dtype=bool)
+            object.__setattr__(self, "plain", nowhere)
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
             ("points", "normals", "colors"), (3,)
         )
-        shapes |= dict.fromkeys(("stddev", "num_views", "view_range"), ())
+        shapes |= dict.fromkeys(("stddev", "num_views", "view_range", "plain"), ())
         for name, tail in shapes.items():
             shape, expected = getattr(self, name).shape, (len(self.points), *tail)
             if shape != expected:
@@ -75,7 +82,7 @@ def write_cloud(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
     """Write a binary PLY.
 
     Properties: x y z (double, world), nx ny nz (float), red green blue (uchar), stddev
-    (float), num_views (int), view_range (float).
+    (float), num_views (int), view_range (float), plain (uchar, 0 or 1).
 
     Args:
         cloud: what to write.
@@ -84,7 +91,7 @@ def write_cloud(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
     """
     table = np.empty(len(cloud), dtype=list(_COLUMNS))
     columns = [*cloud.points.T, *cloud.normals.T, *cloud.colors.T]
-    columns += [cloud.stddev, cloud.num_views, cloud.view_range]
+    columns += [cloud.stddev, cloud.num_views, cloud.view_range, cloud.plain]
     for (name, _), values in zip(_COLUMNS, columns, strict=True):
         table[name] = values
     write_ply(Path(path), [("vertex", table)], comment=f"{_UNIT}{unit}; uwsfm dense")
@@ -132,6 +139,7 @@ def cloud_of_table(table: np.ndarray) -> Cloud:
         stddev=column(STDDEV_NAMES, np.nan).astype(np.float64),
         num_views=column(VIEWS_NAMES, 1).astype(np.int64),
         view_range=column(("view_range",), np.nan).astype(np.float64),
+        plain=column(("plain",), 0) > 0,
     )
 
 

@@ -166,6 +166,22 @@ class Propagation:
         shared = self.optimum.sigma_px**2 * by_unknowns.T @ solved
         return shared + self._own(places, slopes, np.ones(len(places), dtype=bool))
 
+    def shared_variances(self, by_unknowns: Array) -> Array:
+        """Variances (K,) of numbers, as far as they come through the unknowns.
+
+        Args:
+            by_unknowns: (n, K) derivatives by the unknowns of the reduced system.
+
+        Returns:
+            NaN if the data leave something open.
+        """
+        if self._reduced.found is None:
+            return np.full(by_unknowns.shape[1], np.nan)
+        by_unknowns = np.ascontiguousarray(by_unknowns)
+        with suitable_blas(self._reduced.reduction):
+            solved = self._reduced.found.times(by_unknowns)
+        return self.optimum.sigma_px**2 * np.einsum("nk,nk->k", by_unknowns, solved)
+
     def clustered_covariance(self, places: Places, slopes: Array) -> Array:
         """The same, if the observations of a quarter of an image may err together, by
         as much as their residuals show; see `uwsfm.solver.clustered`."""

@@ -127,6 +127,8 @@ def _table(summary: dict[str, Any]) -> "Table":
     table.add_row("contradicted", f"{summary['num_contradicted']}")
     table.add_row("seen by too few", f"{summary['num_unchecked']}")
     table.add_row("points", f"{summary['num_points']}")
+    if summary["num_plain"]:
+        table.add_row("in plain areas, from what is around", f"{summary['num_plain']}")
     table.add_row("voxel", length_words(summary["voxel"], unit))
     table.add_row(
         "noise of a disparity", f"{summary['noise_px']:.2f} px, {summary['noise_from']}"

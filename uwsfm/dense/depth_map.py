@@ -32,6 +32,9 @@ class DepthMap:
     known less well. None: all alike."""
     normals: NDArray[Any] | None = None
     """(H, W, 3) of the surface, in the camera, towards it; None: not known."""
+    plain: NDArray[np.bool_] | None = None
+    """(H, W) where the image itself shows no depth, so that it is that of planes
+    through what is sure around it. None: nowhere."""
 
     @property
     def num_valid(self) -> int:

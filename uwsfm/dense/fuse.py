@@ -54,6 +54,8 @@ class Placed:
     """(H, W) standard deviation from the calibration, metres; zero if it has none."""
     normals: NDArray[np.float32]
     """(H, W, 3) in the camera, towards it; NaN at steps and borders."""
+    plain: NDArray[np.bool_]
+    """(H, W) where the image itself shows no depth."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,8 @@ class _Told:
     sensitivity: Array
     sight: Array
     """(N, 3) unit, from the other camera to the point, in the world."""
+    xy: Array
+    """(N, 2) its pixels."""
 
 
 def noise_px(view: Placed, others: list[Placed]) -> Array:
@@ -155,15 +159,19 @@ def fuse(
     sight /= distance[:, None]
     slant = np.einsum("ni,ni->n", normals, sight)
     weight = sensitivity**-2.0
+    plain = view.plain.ravel()[block]
     verdicts = _Verdicts(len(points))
     for other in others:
         told = _told(other, points)
         # A step along the other's sight moves the surface; along ours by this much.
         turn = np.einsum("ni,ni->n", normals, told.sight) / slant
         turn = np.clip(turn, 1.0 / 3.0, 3.0)
-        verdicts.hear(
+        agrees = verdicts.hear(
             noise, sensitivity, told.difference * turn, told.sensitivity * turn
         )
+        asked = np.flatnonzero(plain & agrees)
+        mark = other.plain.astype(np.uint8)
+        plain[asked] = looked_up(mark, told.xy[asked], nearest=True) > 0
     weight = sensitivity**-2.0 + verdicts.weight
     points += (verdicts.moved / weight)[:, None] * sight
     contradicted = verdicts.num_against >= verdicts.num_views
@@ -178,6 +186,7 @@ def fuse(
         stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
         num_views=verdicts.num_views[keep],
         view_range=distance[keep],
+        plain=plain[keep],
         color_weight=(slant**2 * distance**-2.0)[keep]
         * _color_shares(view.distance, kept, top, bottom),
     )
@@ -222,8 +231,10 @@ class _Verdicts:
         self.seen = np.zeros(count, dtype=bool)
         """By any other."""
 
-    def hear(self, noise: float, own: Array, step: Array, spread: Array) -> None:
-        """One of them.
+    def hear(
+        self, noise: float, own: Array, step: Array, spread: Array
+    ) -> NDArray[np.bool_]:
+        """One of them; with which points it agrees.
 
         Args:
             noise: standard deviation of a disparity, pixels.
@@ -240,6 +251,7 @@ class _Verdicts:
         self.moved[agrees] += w * step[agrees]
         self.weight[agrees] += w
         self.num_views[agrees] += 1
+        return agrees
 
 
 def normals_of(points: NDArray[np.float32], distance: Plane) -> NDArray[np.float32]:
@@ -286,7 +298,9 @@ def _told(other: Placed, points: Array) -> _Told:
     world_from_cam = rigid3.inverse(other.cam_from_world)
     sight = points - world_from_cam[4:]
     sight /= distance[:, None]
-    return _Told(difference=seen - distance, sensitivity=sensitivity, sight=sight)
+    return _Told(
+        difference=seen - distance, sensitivity=sensitivity, sight=sight, xy=xy
+    )
 
 
 def placed(
@@ -308,4 +322,5 @@ def placed(
         sensitivity=depth.sensitivity if alike else depth.sensitivity * depth.spread,
         calibration=calibration,
         normals=normals_of(points, distance) if normals is None else normals,
+        plain=np.zeros(shape, dtype=bool) if depth.plain is None else depth.plain,
     )

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.calibration.propagation import Propagation
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.exposure import SeenColors
@@ -17,6 +18,7 @@ from uwsfm.dense.fuse import Placed, placed
 from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.options import MAX_PIXELS, MAX_STEREO_PIXELS, DenseOptions
 from uwsfm.dense.patchmatch_maps import PatchMatchMaps
+from uwsfm.dense.pose_error import RangeError, range_errors
 from uwsfm.dense.stereo_maps import StereoMaps
 from uwsfm.dense.views import (
     View,
@@ -87,8 +89,8 @@ class DepthMaps:
                 self.views,
                 MAX_PIXELS[options.quality],
             )
-        self._covariance = result.calibration.covariance
-        self.errors: dict[tuple[int, int], CalibrationError | None] = {}
+        self._calibrated = result.calibration
+        self._errors: list[CalibrationError | RangeError | None] = []
 
     def _views(self, matcher: str) -> tuple[list[View], dict[tuple[int, int], str]]:
         """The views, and why pairs of cameras are not compared in rectified images."""
@@ -206,13 +208,13 @@ class DepthMaps:
             self.camera(view),
             cam_from_world(self.model, view.camera, view.frame),
             depth,
-            self._calibration(view, depth),
+            self._calibration(index, depth),
         )
 
-    def _calibration(self, view: View, depth: DepthMap) -> Any:
+    def _calibration(self, index: int, depth: DepthMap) -> Any:
         height, width = depth.ranges.shape
         found = np.zeros((height, width), dtype=np.float32)
-        error = self.errors.get(view.pair)
+        view, error = self.views[index], self._errors[index]
         if error is None:
             return found
         rows = max(1, 200_000 // width)
@@ -227,18 +229,34 @@ class DepthMaps:
         return np.nan_to_num(found)
 
     def prepare_errors(self) -> None:
-        """Find what the calibration adds, before `placed` is called."""
-        covariance = self._covariance
-        for key in {view.pair for view in self.views}:
-            of_key = [view for view in self.views if view.pair == key]
-            self.errors[key] = None
-            if key[0] == key[1]:
-                continue  # between frames it is the poses that err
-            if covariance.determined and len(covariance.border):
-                self.errors[key] = CalibrationError(
-                    self.model.scene,
-                    covariance,
-                    key,
-                    0.8 * min(view.near for view in of_key),
-                    1.5 * max(view.far for view in of_key),
-                )
+        """Find what calibration and poses add, before `placed` is called."""
+        if self.is_stereo:
+            of_pairs = {key: self._pair_error(key) for key in self._pairs()}
+            self._errors = [of_pairs[view.pair] for view in self.views]
+        else:
+            propagation = Propagation(self._calibrated)
+            self._errors = list(range_errors(self.model.scene, propagation, self.views))
+
+    def largest_errors(self) -> dict[tuple[int, int], float | None]:
+        """What `prepare_errors` found at most, of each pair of cameras."""
+        found: dict[tuple[int, int], float | None] = dict.fromkeys(self._pairs())
+        for view, error in zip(self.views, self._errors, strict=True):
+            if error is not None:
+                found[view.pair] = max(found[view.pair] or 0.0, error.largest)
+        return found
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        return sorted({view.pair for view in self.views})
+
+    def _pair_error(self, pair: tuple[int, int]) -> CalibrationError | None:
+        covariance = self._calibrated.covariance
+        if not (covariance.determined and len(covariance.border)):
+            return None
+        of_pair = [view for view in self.views if view.pair == pair]
+        return CalibrationError(
+            self.model.scene,
+            covariance,
+            pair,
+            0.8 * min(view.near for view in of_pair),
+            1.5 * max(view.far for view in of_pair),
+        )

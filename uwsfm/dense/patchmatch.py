@@ -171,11 +171,11 @@ def _nearby(costs, x, y, reach, found):
 
 
 @kernel
-def spread(image, seen, planes, costs, tables, chance, limits, scratch):
+def spread(images, seen, planes, costs, tables, chance, limits, scratch):
     """One round: all pixels of one colour try hypotheses, then those of the other.
 
     Args:
-        image: (h, w) float32.
+        images: (h, w) float32, and (h, w) bool of pixels that keep what they have.
         seen: of `uwsfm.dense.patch`.
         planes: (h, w, 3) hypotheses, improved.
         costs: (h, w, S + 1) of each neighbour and of those that count; kept with them.
@@ -186,12 +186,15 @@ def spread(image, seen, planes, costs, tables, chance, limits, scratch):
             share of pixels that try any depth.
         scratch: (2, K) float32, (S + 9,) float32, (3,) and (4, 2) int64.
     """
+    image, held = images
     height, width = image.shape
     offsets, weights, reach = tables
     patch, share, chosen, nearby = scratch
     for color in range(2):
         for y in range(height):
             for x in range((y + color) % 2, width, 2):
+                if held[y, x]:
+                    continue
                 count = choose(costs, x, y, reach, share, chosen, nearby)
                 _, deviation = take_patch(image, x, y, offsets, weights, patch)
                 state = (chance[0] * _MIX) ^ (

@@ -12,8 +12,9 @@ from uwsfm.dense import patch, patchmatch
 from uwsfm.dense.depth_map import DepthMap, Plane, pixel_rows
 from uwsfm.dense.match import Gray
 from uwsfm.dense.options import ASSUMED_NOISE_PX
+from uwsfm.dense.planar_prior import is_plain, with_planes
 from uwsfm.dense.reduced import for_scale
-from uwsfm.dense.settle import settle
+from uwsfm.dense.settle import rough, settle
 from uwsfm.dense.warp import Placement, table_bytes, warp_table
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.refractive import RefractiveCamera
@@ -50,7 +51,7 @@ best, and up to which the images alone are believed."""
 MIN_CORRELATION = 0.3
 """Of patches, likewise."""
 MIN_AGREEING = 2
-"""Neighbours that have the surface there, too: of what is plain, these decide."""
+"""Neighbours that have the surface there, too: of plain areas, these decide."""
 BYTES_PER_PIXEL, BYTES_PER_NEIGHBOUR = 500, 20
 """In all passes, about, beside the warp's table."""
 SLOPE_PER_PX = 0.3
@@ -114,8 +115,10 @@ class PatchMatch:
         """The first pass: from points as in `start`, to half the image's size."""
         planes = self.start(points)
         for rounds in FIRST:
-            planes, _, _ = self._run(planes, rounds)
-        return planes
+            planes, costs, _ = self._run(planes, rounds)
+        scale = FIRST[-1].scale
+        image = for_scale(self._image, scale)
+        return with_planes(planes, costs[..., -1], image, self._focal / scale)
 
     def settled(self, planes: Hypotheses) -> tuple[Hypotheses, Plane]:
         """The second pass, from the first's hypotheses, then Gauss-Newton.
@@ -124,10 +127,12 @@ class PatchMatch:
             The hypotheses, and (H, W, 5) of `uwsfm.dense.settle`.
         """
         for rounds in SECOND:
-            planes, costs, seen = self._run(planes, rounds)
+            held = is_plain(for_scale(self._image, rounds.scale))
+            planes, costs, seen = self._run(planes, rounds, held)
         found = np.empty((*planes.shape[:2], 5), dtype=np.float32)
         offsets = patch.patch_offsets(stride=1)
-        tables = offsets, patch.color_weights(), patchmatch.REACH
+        roughs = np.array([rough(n.image) for n in self._neighbours], dtype=np.float32)
+        tables = offsets, patch.color_weights(), patchmatch.REACH, roughs
         image = self._image.astype(np.float32)
         num = costs.shape[2] - 1
         settle(
@@ -135,9 +140,12 @@ class PatchMatch:
         )
         return planes, found
 
-    def _run(self, planes: Hypotheses, rounds: Rounds) -> tuple[Any, Any, Any]:
+    def _run(
+        self, planes: Hypotheses, rounds: Rounds, held: NDArray[np.bool_] | None = None
+    ) -> tuple[Any, Any, Any]:
         scale = rounds.scale
         image = for_scale(self._image, scale)
+        held = np.zeros(image.shape, dtype=bool) if held is None else held
         seen = self._seen(scale)
         planes = _resized(planes, image.shape)
         num = len(self._neighbours)
@@ -150,7 +158,7 @@ class PatchMatch:
             chance = np.array([self._seed, self._round], dtype=np.uint64)
             limits = (*self._limits, self._focal / scale, reach, SLOPE_PER_PX * reach)
             patchmatch.spread(
-                image,
+                (image, held),
                 seen,
                 planes,
                 costs,
@@ -200,8 +208,8 @@ def depth_map_of(
         steps = dirs[:, 2].reshape(shape)
         ranges = (depth - origins[:, 2].reshape(shape)) / steps
         spread = np.hypot(spread, LEAST_NOISE_PX)
-        known = (likeness > MIN_CORRELATION) & (spread < SURE_NOISE_PX)
-        known |= found[..., 4] >= MIN_AGREEING
+        sure = (likeness > MIN_CORRELATION) & (spread < SURE_NOISE_PX)
+        known = sure | (found[..., 4] >= MIN_AGREEING)
         known &= ranges > 0.0
         ranges[~known] = np.nan
         sensitivity = depth * depth / (steps * moves)
@@ -221,6 +229,7 @@ def depth_map_of(
         sensitivity=sensitivity.astype(np.float32),
         spread=(spread / ASSUMED_NOISE_PX).astype(np.float32),
         normals=normals.astype(np.float32),
+        plain=known & ~sure,
     )
 
 

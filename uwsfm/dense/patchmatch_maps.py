@@ -29,7 +29,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.sfm.steps import fingerprint
 
-FORMAT = 4
+FORMAT = 5
 """Of the hypotheses and of what is made of them: others are made again."""
 KEPT_IMAGES = 16
 """Grey images in memory."""
@@ -46,9 +46,9 @@ class PatchMatchMaps:
         max_pixels: larger images are reduced by a whole number.
     """
 
-    bytes_on_disk = 36
+    bytes_on_disk = 37
     """Per pixel: two floats in single precision, three of a normal, one of the spread,
-    and a quarter of three of the first pass."""
+    a mark, and a quarter of three of the first pass."""
     has_search = True
     is_stereo = False
 

@@ -170,6 +170,7 @@ class _Run:
             "calibration_stddev_max": self._calibration_summary(),
             "stddev_percentiles": _percentiles(cloud.stddev),
             "range_percentiles": _percentiles(cloud.view_range),
+            "num_plain": int(np.count_nonzero(cloud.plain)),
             "num_views_mean": float(np.mean(cloud.num_views)),
             "depth_maps": matched,
             "pairs_left_out": {
@@ -250,10 +251,8 @@ class _Run:
     # Fusion.
 
     def _calibration_summary(self) -> dict[str, float | None]:
-        return {
-            f"{a}-{b}": None if error is None else error.largest
-            for (a, b), error in self.maps.errors.items()
-        }
+        largest = self.maps.largest_errors()
+        return {f"{a}-{b}": value for (a, b), value in largest.items()}
 
     def _noise(self) -> tuple[float, bool]:
         """Standard deviation of a disparity, and whether it is only assumed."""

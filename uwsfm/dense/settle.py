@@ -11,6 +11,7 @@ import numpy as np
 from uwsfm._base.jit import inner, inner_fused, kernel
 from uwsfm.dense.patch import RADIUS, affine, objection, shows, take_patch
 from uwsfm.dense.patchmatch import choose
+from uwsfm.dense.planar_prior import plain_energy, slope_energy
 
 NUM_STEPS = 2
 STILL_PX = 0.03
@@ -19,22 +20,34 @@ HYPOTHESIS_PX = 1.0
 """Standard deviation of a hypothesis, pixels in the neighbours."""
 AGREES_PX = 1.5
 """Between a point and a neighbour's hypothesis there."""
+NOISE_MARGIN = 1.5
+"""Plain windows scatter: so much more than theirs may be noise."""
 _F = np.float32
 _ZERO, _ONE = _F(0.0), _F(1.0)
 _NEXT = np.uint32(1)
 
 
+def rough(image):
+    """Variance of a grey image's slopes that is noise, per pixel and axis, as the
+    interpolation between pixels leaves it (two thirds, on average).
+
+    Args:
+        image: (h, w).
+    """
+    return NOISE_MARGIN * plain_energy(slope_energy(image)) * 2.0 / 3.0
+
+
 @inner_fused
 def _equations(images, place, at, moved, offsets, patch, deviation):
-    """Normal equation of one neighbour: slope squared, slope by error, error squared.
+    """Normal equation of one neighbour: slope squared, slope by error, correlation.
 
     Args:
         images: as in `uwsfm.dense.patch`.
-        place: where the neighbour's begins, and its width.
+        place: where the neighbour's begins, its width, and its `rough`.
         at: u, v, a, b, c, d of the affine map.
         moved: du/dw and dv/dw.
     """
-    begin, width = place
+    begin, width, rough = place
     u, v, a, b, c, d = at
     mean, square, product = _ZERO, _ZERO, _ZERO
     slope, slopes, by_gray, by_patch = _ZERO, _ZERO, _ZERO, _ZERO
@@ -61,9 +74,14 @@ def _equations(images, place, at, moved, offsets, patch, deviation):
         by_patch += weight * change * own
     contrast = np.sqrt(max(square - mean * mean, _ZERO) + _ONE)
     # Errors are own / deviation - (gray - mean) / contrast, slopes less their mean.
-    h = (slopes - slope * slope) / (contrast * contrast)
+    h = slopes - slope * slope
+    # Slopes that are noise tell nothing: what they share of h, they share of e.
+    told = h - rough * (moved[0] * moved[0] + moved[1] * moved[1])
+    told = max(told, _ZERO) / max(h, _F(1e-12))
+    h *= told / (contrast * contrast)
     e = by_patch / (deviation * contrast)
     e -= (by_gray - slope * mean) / (contrast * contrast)
+    e *= told
     correlation = product / (deviation * contrast)
     return h, e, correlation
 
@@ -77,14 +95,15 @@ def settle(image, seen, planes, costs, tables, scratch, found):
         seen: of `uwsfm.dense.patch`.
         planes: (h, w, 3) hypotheses.
         costs: (h, w, S + 1) of them.
-        tables: `patch_offsets` (every pixel), `color_weights`, `REACH`.
+        tables: `patch_offsets` (every pixel), `color_weights`, `REACH`, and (S,)
+            float32 `rough` of each neighbour.
         scratch: (2, K) float32, (S + 9,) float32, (3,) and (4, 2) int64.
         found: (h, w, 5), written: inverse depth; pixels that a point moves in the
             neighbours per inverse depth, root mean square; deviation in those pixels;
             correlation; how many neighbours have the surface there, too. NaN where no
             neighbour shows it.
     """
-    offsets, weights, reach = tables
+    offsets, weights, reach, roughs = tables
     patch, share, chosen, nearby = scratch
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
@@ -96,7 +115,7 @@ def settle(image, seen, planes, costs, tables, scratch, found):
                 spread += patch[1, k] * patch[1, k]
             _settled(
                 seen, x, y, planes, (chosen, count),
-                (offsets, patch, deviation, spread), found,
+                (offsets, roughs, patch, deviation, spread), found,
             )  # fmt: skip
 
 
@@ -105,19 +124,18 @@ def _settled(seen, x, y, planes, choice, own, found):
     """One pixel."""
     images, sizes = seen[0], seen[1]
     chosen, count = choice
-    offsets, patch, deviation, spread = own
+    offsets, roughs, patch, deviation, spread = own
     w, gx, gy = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2]
     held = _ONE / _F(HYPOTHESIS_PX * HYPOTHESIS_PX)
     for step in range(NUM_STEPS + 1):
         h, e, correlation, moves, used = _ZERO, _ZERO, _ZERO, _ZERO, 0
-        agreeing = 0
         for n in range(count):
             s = chosen[n]
             u, v, a, b, c, d, uw, vw = affine(seen, s, x, y, w, gx, gy)
             if not shows(sizes, s, u, v, a, b, c, d, _F(RADIUS)):
                 continue
             at, moved = (u, v, a, b, c, d), (uw, vw)
-            place = np.uint32(sizes[s, 2]), np.int32(sizes[s, 1])
+            place = np.uint32(sizes[s, 2]), np.int32(sizes[s, 1]), roughs[s]
             h_s, e_s, like = _equations(
                 images, place, at, moved, offsets, patch, deviation
             )
@@ -126,9 +144,6 @@ def _settled(seen, x, y, planes, choice, own, found):
             correlation += like
             moves += uw * uw + vw * vw
             used += 1
-            if seen[4].shape[1] > 0:
-                apart = objection(seen, s, x, y, w, u, v, uw, vw)
-                agreeing += 1 if apart < _F(AGREES_PX) else 0
         if used == 0:
             return
         moves = np.sqrt(moves / _F(used))
@@ -143,4 +158,19 @@ def _settled(seen, x, y, planes, choice, own, found):
                 break
     found[y, x, 0], found[y, x, 1], found[y, x, 3] = w, moves, correlation
     found[y, x, 2] = moves * np.sqrt(noise / (h + damping))
-    found[y, x, 4] = _F(agreeing)
+    found[y, x, 4] = _agreeing(seen, x, y, w, gx, gy)
+
+
+@inner
+def _agreeing(seen, x, y, w, gx, gy):
+    """How many neighbours have the surface there, too."""
+    count = _ZERO
+    if seen[4].shape[1] == 0:
+        return count
+    for s in range(seen[1].shape[0]):
+        u, v, a, b, c, d, uw, vw = affine(seen, s, x, y, w, gx, gy)
+        if shows(seen[1], s, u, v, a, b, c, d, _F(RADIUS)) and (
+            objection(seen, s, x, y, w, u, v, uw, vw) < _F(AGREES_PX)
+        ):
+            count += _ONE
+    return count

@@ -18,7 +18,7 @@ from uwsfm.cloud import Cloud
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 
-BYTES_PER_VOXEL = 205
+BYTES_PER_VOXEL = 207
 """Where all become a cloud and its file, about."""
 COARSER = 2.0**0.5
 """Of a side, so that half of the voxels of a surface remain."""
@@ -37,6 +37,7 @@ class Fused:
     stddev: Array
     num_views: NDArray[np.int64]
     view_range: Array
+    plain: NDArray[np.bool_]
     color_weight: Array
     """(N,) how well the image shows the colour: less at an edge, where it is mixed with
     that of another surface, from aside and from afar."""
@@ -77,7 +78,7 @@ class Voxels:
         rows["position"] = weight[:, None] * local
         rows["normal"] = np.nan_to_num(weight[:, None] * fused.normals)
         rows["stddev"] = weight * fused.stddev
-        for name in ("num_views", "view_range"):
+        for name in ("num_views", "view_range", "plain"):
             rows[name] = getattr(fused, name)
         rows["color_weight"] = fused.color_weight
         rows["color"] = fused.color_weight[:, None] * fused.colors
@@ -135,7 +136,7 @@ class Voxels:
                 cloud.normals[to] = np.where(length > 0.0, normals / length, np.nan)
             cloud.points[to] = rows["position"] / weight + self._origin
             cloud.stddev[to] = rows["stddev"] / rows["weight"]
-            for name in ("num_views", "view_range"):
+            for name in ("num_views", "view_range", "plain"):
                 getattr(cloud, name)[to] = rows[name]
             mean = rows["color"] / rows["color_weight"][:, None]
             cloud.colors[to] = np.rint(mean).astype(np.uint8)
@@ -153,6 +154,7 @@ _ROW = np.dtype(
         ("color_weight", "<f4"),
         ("num_views", "<i4"),
         ("view_range", "<f4"),
+        ("plain", "?"),
     ]
 )
 
@@ -165,11 +167,13 @@ def _room_for(count: int) -> Cloud:
         stddev=np.empty(count),
         num_views=np.empty(count, dtype=np.int64),
         view_range=np.empty(count),
+        plain=np.empty(count, dtype=bool),
     )
 
 
 def _merged(rows: np.ndarray) -> np.ndarray:
-    """One row per key: sums, the most views, and the nearest range."""
+    """One row per key: sums, the most views, the nearest range, and whether it is plain
+    in all of them."""
     if not len(rows):
         return rows
     order = np.lexsort((rows["view_range"], rows["key"]))
@@ -180,4 +184,5 @@ def _merged(rows: np.ndarray) -> np.ndarray:
     for name in ("weight", "position", "normal", "stddev", "color", "color_weight"):
         merged[name] = np.add.reduceat(rows[name], starts, axis=0)
     merged["num_views"] = np.maximum.reduceat(rows["num_views"], starts)
+    merged["plain"] = np.logical_and.reduceat(rows["plain"], starts)
     return merged

@@ -23,8 +23,8 @@ def write_las(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
     """Write a LAS 1.4 file, or LAZ by its suffix.
 
     Coordinates are those of the world frame. Extra dimensions: stddev (float, along
-    the line of sight), num_views (unsigned short), view_range (float); each only if it
-    is known of some point.
+    the line of sight), num_views (unsigned short), view_range (float), plain (0 or 1);
+    each only if it is known of some point.
 
     Args:
         cloud: what to write.
@@ -56,6 +56,8 @@ def write_las(cloud: Cloud, path: str | Path, unit: str = "metre") -> None:
         "view_range": shown.view_range.astype(np.float32),
         "num_views": np.minimum(shown.num_views, 65_535).astype(np.uint16),
     }
+    if np.any(shown.plain):
+        columns["plain"] = np.asarray(shown.plain, dtype=np.uint8)
     known = {name: v for name, v in columns.items() if np.any(np.isfinite(v))}
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name=n, type=v.dtype) for n, v in known.items()]
