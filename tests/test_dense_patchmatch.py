@@ -134,7 +134,7 @@ def test_a_plain_area_is_filled_and_marked_and_known_less_well():
     px = np.abs(depth.ranges - truth) / depth.sensitivity
     disc = discs[0]
     assert np.count_nonzero(disc) > 3000
-    # Without the planes less than half of it.
+    # Without the planes it is about half.
     assert np.mean(np.isfinite(px[disc])) > 0.97
     # A pixel is what they say; corners at its rim, which the planes go through, are
     # known to 0.2 px.
