@@ -29,7 +29,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.sfm.steps import fingerprint
 
-FORMAT = 5
+FORMAT = 8
 """Of the hypotheses and of what is made of them: others are made again."""
 KEPT_IMAGES = 16
 """Grey images in memory."""

@@ -16,10 +16,10 @@ from scipy.spatial import Delaunay, QhullError
 from uwsfm.dense.match import Gray
 from uwsfm.dense.patch import RADIUS
 
-PLAIN_PERCENT, PLAIN_SHARE = 2.0, 0.03
+PLAIN_PERCENT, PLAIN_SHARE = 2.0, 0.01
 """Windows that are taken for plain, and at most how much of the slopes of all windows
 theirs have: an image that has texture everywhere has no plain ones."""
-TIMES_PLAIN = 3.0
+TIMES_PLAIN = 1.5
 """What of an image counts as plain."""
 QUANTIZED = 1.0 / 6.0
 """Grey levels squared: slopes that rounding makes."""

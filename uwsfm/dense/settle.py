@@ -23,7 +23,7 @@ AGREES_PX = 1.5
 NOISE_MARGIN = 1.5
 """Plain windows scatter: so much more than theirs may be noise."""
 _F = np.float32
-_ZERO, _ONE = _F(0.0), _F(1.0)
+_ZERO, _ONE, _TINY = _F(0.0), _F(1.0), _F(1e-12)
 _NEXT = np.uint32(1)
 
 
@@ -75,9 +75,9 @@ def _equations(images, place, at, moved, offsets, patch, deviation):
     contrast = np.sqrt(max(square - mean * mean, _ZERO) + _ONE)
     # Errors are own / deviation - (gray - mean) / contrast, slopes less their mean.
     h = slopes - slope * slope
-    # Slopes that are noise tell nothing: what they share of h, they share of e.
-    told = h - rough * (moved[0] * moved[0] + moved[1] * moved[1])
-    told = max(told, _ZERO) / max(h, _F(1e-12))
+    # Slopes that may all be noise tell nothing, twice as much are believed.
+    noise = rough * (moved[0] * moved[0] + moved[1] * moved[1])
+    told = min(max(h / max(noise, _TINY) - _ONE, _ZERO), _ONE)
     h *= told / (contrast * contrast)
     e = by_patch / (deviation * contrast)
     e -= (by_gray - slope * mean) / (contrast * contrast)
