@@ -56,6 +56,17 @@ class Placed:
     """(H, W, 3) in the camera, towards it; NaN at steps and borders."""
     plain: NDArray[np.bool_]
     """(H, W) where the image itself shows no depth."""
+    images: frozenset[tuple[int, int]]
+    """Camera and frame of all images that it was made of."""
+
+    def alone(self, other: Placed) -> float:
+        """Share of the variance of both that their difference shows.
+
+        Errors come from images, and what two depth maps have in common cancels: so far
+        as their images are the same, so are their errors.
+        """
+        common = len(self.images & other.images)
+        return 1.0 - common / max(len(self.images | other.images), 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +106,8 @@ class _Told:
 def noise_px(view: Placed, others: list[Placed]) -> Array:
     """Differences between depth maps in pixels of disparity, of both together (n,).
 
-    Where both see the same surface their spread is the noise of one disparity.
+    Where both see the same surface their spread is the noise of one disparity. What
+    depth maps of the same images have in common is made up for.
     """
     rows = np.arange(0, view.distance.shape[0], _SAMPLE_STEP)
     columns = np.arange(0, view.distance.shape[1], _SAMPLE_STEP)
@@ -106,9 +118,11 @@ def noise_px(view: Placed, others: list[Placed]) -> Array:
     in_world = rigid3.transform(rigid3.inverse(view.cam_from_world), points[keep])
     found = []
     for other in others:
-        told = _told(other, in_world)
-        both = np.hypot(own[keep], told.sensitivity)
-        found.append(told.difference / both)
+        alone = view.alone(other)
+        if alone > 0.0:
+            told = _told(other, in_world)
+            both = np.hypot(own[keep], told.sensitivity) * np.sqrt(alone)
+            found.append(told.difference / both)
     all_px = np.concatenate(found) if found else np.empty(0)
     with np.errstate(invalid="ignore"):
         return all_px[np.abs(all_px) < _GATE_PX]
@@ -167,7 +181,8 @@ def fuse(
         turn = np.einsum("ni,ni->n", normals, told.sight) / slant
         turn = np.clip(turn, 1.0 / 3.0, 3.0)
         agrees = verdicts.hear(
-            noise, sensitivity, told.difference * turn, told.sensitivity * turn
+            *(noise * np.sqrt(view.alone(other)), sensitivity),
+            *(told.difference * turn, told.sensitivity * turn),
         )
         asked = np.flatnonzero(plain & agrees)
         mark = other.plain.astype(np.uint8)
@@ -237,7 +252,7 @@ class _Verdicts:
         """One of them; with which points it agrees.
 
         Args:
-            noise: standard deviation of a disparity, pixels.
+            noise: standard deviation of a disparity, pixels, as differences show it.
             own: (N,) metres per pixel of disparity.
             step: (N,) how much farther it has the surface; NaN where it has none.
             spread: (N,) its metres per pixel.
@@ -304,7 +319,11 @@ def _told(other: Placed, points: Array) -> _Told:
 
 
 def placed(
-    camera: RefractiveCamera, cam_from_world: Array, depth: DepthMap, calibration: Plane
+    camera: RefractiveCamera,
+    cam_from_world: Array,
+    depth: DepthMap,
+    calibration: Plane,
+    images: frozenset[tuple[int, int]] = frozenset(),
 ) -> Placed:
     """A depth map with its points."""
     origins, dirs = camera.ray_from_img(pixel_rows(camera, 0, camera.height))
@@ -323,4 +342,5 @@ def placed(
         calibration=calibration,
         normals=normals_of(points, distance) if normals is None else normals,
         plain=np.zeros(shape, dtype=bool) if depth.plain is None else depth.plain,
+        images=images,
     )

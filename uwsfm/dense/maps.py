@@ -209,6 +209,7 @@ class DepthMaps:
             cam_from_world(self.model, view.camera, view.frame),
             depth,
             self._calibration(index, depth),
+            frozenset({(view.camera, view.frame), *view.others}),
         )
 
     def _calibration(self, index: int, depth: DepthMap) -> Any:
