@@ -56,12 +56,17 @@ def _glass(item: Departure) -> Reason | None:
         return None
     each = next(p for p in OF_PORTS if p.accuracy and p.accuracy.key == item.what)
     unit, per = f" {each.unit.name}".rstrip(), each.unit.per
+    found, known = (
+        f"{per * value:.5g} ± {per * stddev:.2g}{unit}"
+        for value, stddev in (
+            (item.estimate, item.stddev),
+            (item.given, item.given_stddev),
+        )
+    )
+    source = "as given" if item.stated else "an accuracy that is assumed"
     text = (
-        f"Camera {item.camera}: the {each.name} came out at "
-        f"{per * item.estimate:.5g} ± {per * item.stddev:.2g}{unit}, against {per * item.given:.5g} ± "
-        f"{per * item.given_stddev:.2g}{unit}, "
-        f"{'as given' if item.stated else 'an accuracy that is assumed'}; measure it, "
-        "and check the port distance, the lens and units."
+        f"Camera {item.camera}: the {each.name} came out at {found}, against {known}, "
+        f"{source}; measure it, and check the port distance, the lens and units."
     )
     return reason("glass", text, DOUBTFUL, **_numbers(item))
 
