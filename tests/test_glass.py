@@ -1,10 +1,13 @@
 """Thickness and index of the glass: refined through thick windows, else held."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bounds import LEAST, MOST
+from sfm_scenes import model_of
+from summary_schema import schema_faults
 
 from uwsfm import InputError, NoPort, UwsfmError, calibrate
 from uwsfm.calibration.assumed import assumed_accuracy
@@ -14,15 +17,20 @@ from uwsfm.calibration.parameters import GLASS_INDEX, THICKNESS
 from uwsfm.calibration.prior_verdicts import prior_verdict
 from uwsfm.calibration.solves import _check_bounds
 from uwsfm.calibration.uncertainty import predict_covariance
+from uwsfm.jobs.calibrate_housing import calibrate_housing
 from uwsfm.jobs.checks import require_effect
+from uwsfm.jobs.output_folder import HOUSING_SUMMARY
 from uwsfm.residuals import border
+from uwsfm.results.files import export_colmap
+from uwsfm.rig.file import dump_rig, load_rig
 from uwsfm.rig.rig import RigAccuracy
-from uwsfm.simulate import ObservationOptions, Relief, simulate_scene
-from uwsfm.simulate.rigs import paper_rig
+from uwsfm.simulate import ObservationOptions, Relief, perturbed, simulate_scene
+from uwsfm.simulate.rigs import nominal_rig, paper_rig, sample_rig
 from uwsfm.simulate.trajectories import rich_motion
 from uwsfm.solver.state import State
+from uwsfm.trust.shared_numbers import shared_numbers
 
-NOISE_PX = 0.1
+NOISE_PX, RELIEF = 0.1, Relief(stddev=0.2)
 THICK_M, THIN_M = 0.08, 0.005
 CASES = {
     # What is refined, what is known of it, and the names in a port.
@@ -41,7 +49,7 @@ def dive(thickness, noise_px=NOISE_PX):
     """Wide lenses; ports whose distance a ruler told."""
     rig = paper_rig(thickness=thickness, focal_px=500.0)
     options = ObservationOptions(num_points=150, noise_px=noise_px)
-    return simulate_scene(rig, rich_motion(8), Relief(stddev=0.2), options)
+    return simulate_scene(rig, rich_motion(8), RELIEF, options)
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +191,51 @@ def test_glass_that_leaves_its_bounds_ends_in_one_sentence(thin):
         with pytest.raises(UwsfmError, match="of camera number 2 came out at") as told:
             _check_bounds(replace(state, ports=ports), columns)
         assert "\n" not in str(told.value) and "give a prior" in str(told.value)
+
+
+def test_a_job_refines_the_glass_and_writes_what_it_knows(tmp_path):
+    options = ObservationOptions(num_points=300, noise_px=0.3)
+    simulated = simulate_scene(sample_rig(), rich_motion(8), RELIEF, options)
+    rig = nominal_rig(sample_rig())
+    export_colmap(model_of(rig, perturbed(simulated.scene)), tmp_path / "sparse")
+    dump_rig(rig, tmp_path / "rig.yaml", "a rig")  # which is exact
+    calibrate_housing(
+        tmp_path / "rig.yaml",
+        tmp_path / "sparse",
+        tmp_path / "out",
+        refine=("glass-thickness",),
+        prior={"thickness_stddev_m": 0.001},
+    )
+    summary = json.loads((tmp_path / "out" / HOUSING_SUMMARY).read_text())
+    assert schema_faults(summary) == []
+    rows = {row["name"]: row for row in summary["refined"]}
+    assert set(rows) == {"glass thickness of left (m)", "glass thickness of right (m)"}
+    text = (tmp_path / "out" / "housing.yaml").read_text(encoding="utf-8")
+    assert text.count("# glass thickness: standard deviation ") == 2
+    back = load_rig(tmp_path / "out" / "housing.yaml")
+    for camera in back.cameras:
+        row = rows[f"glass thickness of {camera.name} (m)"]
+        assert row["verdict"] == "held by the prior"
+        assert camera.port.thickness == pytest.approx(row["value"], rel=1e-9)
+        stated = camera.accuracy.thickness_m
+        assert stated == pytest.approx(row["stddev_in_all"], rel=1e-3)
+        assert abs(row["value"] - 0.02) < 3.0 * 0.001
+
+
+def test_halves_compare_the_glass_too():
+    results = []
+    for seed in (0, 1):
+        options = ObservationOptions(num_points=150, noise_px=NOISE_PX, seed=seed)
+        rig = paper_rig(thickness=THICK_M, focal_px=500.0)
+        scene = simulate_scene(rig, rich_motion(8), RELIEF, options).scene
+        known = {"refine_distances": False, "refine_glass_thickness": True}
+        results.append(calibrate(scene, loss="l2", **known))
+    found = shared_numbers(results[0], results[1], ["left", "right"])
+    rows = [found.numbers[k] for k in found.of(THICKNESS.group)]
+    assert [row.name for row in rows] == [
+        "glass thickness of left",
+        "glass thickness of right",
+    ]
+    for row, port in zip(rows, results[1].scene.ports, strict=True):
+        assert row.unit == "mm" and abs(row.z) < 4.0
+        assert row.values[1] == pytest.approx(1e3 * port.thickness)

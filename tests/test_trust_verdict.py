@@ -342,7 +342,11 @@ TRIGGERS = {
         DOES_NOT_FIT,
     ),
     "glass": (
-        {"departures": (departure("thickness_m", 0.05, 0.08, 2e-3, given_stddev=5e-3),)},
+        {
+            "departures": (
+                departure("thickness_m", 0.05, 0.08, 2e-3, given_stddev=5e-3),
+            )
+        },
         DOUBTFUL,
     ),
     "focal_length": (
