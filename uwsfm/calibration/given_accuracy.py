@@ -69,7 +69,8 @@ class CameraAccuracy:
     """Standard deviations of one camera's given numbers; None: the default is assumed.
 
     What is refined without a prior is not given: its entry has no effect on estimates
-    and deviations, only on the verdict, for which it is a claim.
+    and deviations, only on the verdict, for which it is a claim. Of what the images
+    hardly determine (`Prior.from_accuracy`: the glass) the entry is the prior.
     """
 
     focal: float | None = None
