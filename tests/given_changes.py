@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from uwsfm.calibration.assumed import assumed_accuracy
 from uwsfm.calibration.given_accuracy import GivenAccuracy
-from uwsfm.calibration.given_errors import assumed_accuracy
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.residuals import border

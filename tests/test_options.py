@@ -177,7 +177,7 @@ def refused(tmp_path, text: str) -> str:
         ("prior: 3", "prior: must be a block of keys, not 3"),
         ("lever_arm: [1, 2]", "--lever-arm 1,2: write three numbers X,Y,Z in metres"),
         ("prior: {focal_stddev: 5}", "--prior focal_stddev=5: 5 is no plausible stand"),
-        ("prior: {focal: 1}", "--prior focal=1: the key is one of distance_stddev_m,"),
+        ("prior: {focal: 1}", "--prior focal=1: the key is one of normal_stddev_deg,"),
         ("scene_distance_m: -1", "--scene-distance (scene_distance_m) must be positiv"),
         ("a: [", "line 2: not valid YAML"),
         ("", "is empty instead of keys such as 'seed: 1'"),
@@ -285,7 +285,10 @@ def test_a_result_has_the_options_that_it_was_made_with(dive_result):
         ),
         ({"mapper": "x"}, "mapper must be one of pinhole, refractive, got 'x'"),
         ({"num_threads": 0}, r"--threads \(num_threads\) must be positive, or -1"),
-        ({"refine": ["x"]}, "refine must be one of water-index, focal, .*, got 'x'"),
+        (
+            {"refine": ["x"]},
+            "refine must be one of glass-thickness, .*, got 'x'",
+        ),
     ],
 )
 def test_values_in_python_are_checked_when_they_are_given(options, words):

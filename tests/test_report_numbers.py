@@ -175,7 +175,8 @@ def test_what_the_page_says_in_sentences(page, report):
     assert "Not registered: 0003.jpg, 0011.jpg, 0012.jpg, 0040.jpg." in text
     for name, counts in zip(("left", "right"), report.coverage, strict=True):
         assert f"{name} {counts.num_images} images; median of" in text
-    assert "the glass and the baseline. Those in all" in text  # the water was refined
+    # Water, baseline and a focal length were refined.
+    assert "what is held of the lens in air and the glass. Those in all" in text
     assert "uwsfm 9.8.7," in text and report.title in text
     plain = text_of(page_of(replace(report, summary=summary(refined=[]))))
     assert "the glass, the water index and the baseline." in plain

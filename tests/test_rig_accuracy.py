@@ -10,14 +10,13 @@ from given_changes import scaled_accuracy
 
 from uwsfm import calibrate
 from uwsfm._base.options import option_named
-from uwsfm.calibration import given_accuracy as defaults
 from uwsfm.calibration.error_budget import with_budget
 from uwsfm.calibration.given_accuracy import (
     CameraAccuracy,
     NamedCovariance,
     RigAccuracy,
 )
-from uwsfm.calibration.problem import PRIORS
+from uwsfm.calibration.parameters import DIRECTION, PRIORS
 from uwsfm.calibration.tilt import paper_tilt
 from uwsfm.cli.options import numbers_of
 from uwsfm.errors import InputError
@@ -78,7 +77,7 @@ def test_what_is_given_arrives_and_the_rest_is_assumed(tmp_path):
         stddevs[1, border.NORMAL], np.radians(1.0) / np.sqrt(2.0)
     )
     np.testing.assert_allclose(stddevs[1, border.ROTATION], np.radians(0.05))
-    direction = np.radians(defaults.DIRECTION_DEG)
+    direction = np.radians(DIRECTION.accuracy.default())
     np.testing.assert_allclose(stddevs[1, border.DIRECTION], direction)
     assert assumed[1, border.DIRECTION].all()
     # Both ports look into one water.

@@ -22,12 +22,12 @@ from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
 from uwsfm.models.ports.port import NoPort
 from uwsfm.residuals import border
+from uwsfm.results.refined import refined_summary
 from uwsfm.results.summary import (
     budget_summary,
     errors_summary,
     housing_summary,
     outside_summary,
-    refined_summary,
     scale_summary,
 )
 from uwsfm.solver.layout import build_layout

@@ -341,6 +341,14 @@ TRIGGERS = {
         {"departures": (departure("center_share", 0.0, 0.97, 0.02, given_stddev=0.2),)},
         DOES_NOT_FIT,
     ),
+    "glass": (
+        {
+            "departures": (
+                departure("thickness_m", 0.05, 0.08, 2e-3, given_stddev=5e-3),
+            )
+        },
+        DOUBTFUL,
+    ),
     "focal_length": (
         {"departures": (departure("focal_share", 1.0, 1.33, 0.01, given_stddev=0.03),)},
         DOES_NOT_FIT,
@@ -383,6 +391,7 @@ def test_each_reason_is_given_when_its_number_is_wrong_and_only_then(fitting, co
         ("distance_m", 0.01, 0.43),
         ("tilt_deg", 0.0, 40.0),
         ("center_share", 0.0, 0.9),
+        ("glass_index", 1.5, 1.6),
         ("focal_share", 1.0, 2.0),
         ("principal_point_px", 0.0, 300.0),
     ],

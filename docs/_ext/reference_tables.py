@@ -22,6 +22,8 @@ from sphinx.application import Sphinx
 
 import uwsfm
 from uwsfm.calibration import given_accuracy
+from uwsfm.calibration.parameter import Accuracy
+from uwsfm.calibration.parameters import PARAMETERS
 from uwsfm.inputs import lengths_file
 from uwsfm.jobs import dives_file
 from uwsfm.measuring import measurements_file
@@ -194,7 +196,20 @@ def accuracy_limits() -> str:
 
 
 def accuracy_defaults() -> str:
-    """The module's constants with the sentence that stands below each."""
+    """The defaults of the parameters, and the module's constants with the sentence that
+    stands below each."""
+    declared = [each.accuracy for each in PARAMETERS if each.accuracy is not None]
+    stated = [[f"`{own.key}`", _default_accuracy(own), own.because] for own in declared]
+    return table(["default", "value", "reason"], stated + _constants(), "sentences")
+
+
+def _default_accuracy(own: Accuracy) -> str:
+    share = f"{own.share:g} of the value" if own.share else ""
+    least = f"{own.least:g}" if own.least else ""
+    return ", at least ".join(filter(None, [share, least]))
+
+
+def _constants() -> list[list[str]]:
     body = ast.parse(inspect.getsource(given_accuracy)).body
     rows = []
     for node, after in zip(body, body[1:], strict=False):
@@ -211,7 +226,7 @@ def accuracy_defaults() -> str:
         values = ", ".join(f"{getattr(given_accuracy, name):g}" for name in names)
         why = " ".join(ast.literal_eval(after.value).split())
         rows.append([", ".join(f"`{name}`" for name in names), values, why])
-    return table(["default", "value", "reason"], rows, "sentences")
+    return rows
 
 
 def yaml_files() -> str:

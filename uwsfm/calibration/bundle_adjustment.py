@@ -13,6 +13,7 @@ import numpy as np
 
 from uwsfm.calibration.absolute_constraints import Outside
 from uwsfm.calibration.lengths import Lengths
+from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.result import CalibrateSummary, CalibrationResult
 from uwsfm.calibration.scaling import moved
@@ -129,10 +130,11 @@ def _check(scene: Scene, settings: CalibrateOptions, lengths: Lengths | None) ->
             f"error 'point_3d' tells nothing from {frames} frame: its points can be "
             "where the rays meet, whatever the ports; add frames or use another error"
         )
-    if settings.refine_water_index and all(
-        isinstance(port, NoPort) for port in scene.ports
-    ):
-        raise InputError("refine_water_index: no camera is behind a port")
+    bare = all(isinstance(port, NoPort) for port in scene.ports)
+    for each in OF_PORTS:
+        wanted = np.any(settings.refines(each, len(scene.cameras)))
+        if bare and wanted and each.refine is not None and each.refine.flag:
+            raise InputError(f"{each.refine.field}: no camera is behind a port")
     other = [c for c, p in enumerate(scene.ports) if not isinstance(p, FlatPort)]
     if other and settings.error_name != "reprojection":
         raise InputError(

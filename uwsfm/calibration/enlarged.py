@@ -10,6 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from uwsfm.calibration.parameters import PARAMETERS
+from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import (
     CalibrationResult,
     CameraCovariance,
@@ -17,19 +19,8 @@ from uwsfm.calibration.result import (
     InAll,
 )
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
-from uwsfm.residuals import border
+from uwsfm.models.ports.port import Port
 from uwsfm.solver.layout import HELD
-
-_SHARED: dict[str, int | slice] = {
-    "rotation": border.ROTATION,
-    "direction": border.DIRECTION,
-    "baseline": border.LENGTH,
-    "water index": border.WATER_INDEX,
-    "lens": border.LENS,
-}
-_FLAT: dict[str, int | slice] = {"tilt": border.NORMAL, "distance": border.DISTANCE}
-_DOME: dict[str, int | slice] = {"center": border.CENTER}
 
 
 def enlarged(
@@ -71,14 +62,10 @@ def column_factors(
     """(B,) factor of each refined parameter."""
     grow = np.ones(len(covariance.border))
     for columns, port in zip(covariance.border_cols, ports, strict=True):
-        slots = dict(_SHARED)
-        if isinstance(port, FlatPort):
-            slots |= _FLAT
-        elif isinstance(port, DomePort):
-            slots |= _DOME
-        for group, slot in slots.items():
-            some = np.atleast_1d(columns[slot])
-            grow[some[some != HELD]] = factors.get(group, 1.0)
+        for parameter in PARAMETERS:
+            if port_kind(port) in parameter.ports:
+                some = np.atleast_1d(columns[parameter.slots])
+                grow[some[some != HELD]] = factors.get(parameter.group, 1.0)
     return grow
 
 

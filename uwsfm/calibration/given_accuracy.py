@@ -17,14 +17,23 @@ from uwsfm.calibration.named_covariance import (
     require_stated_once,
     steps_of_names,
 )
+from uwsfm.calibration.parameter import Parameter
+from uwsfm.calibration.parameters import (
+    BASELINE,
+    CENTER,
+    DIRECTION,
+    FOCAL,
+    OF_PORTS,
+    OF_RIG,
+    PRINCIPAL_POINT,
+    ROTATION,
+    TILT,
+    WATER_INDEX,
+)
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
 
-FOCAL = 1e-3
-"""Relative. Two calibrations in air of one lens differ by so much, or by more."""
-PRINCIPAL_POINT_PX = 1.0
-"""Per coordinate; the same comparison."""
 CORNER = 0.005
 """How far each radial coefficient alone may move the image corner, as a share of its
 distance from the centre: 0.01 of k1 for a lens whose corners are 35 degrees off."""
@@ -37,26 +46,6 @@ every calibration trades one for the next. Together they move the corner by a pi
 so, as two calibrations of one lens differ."""
 FX_AGAINST_FY = 0.99
 """Correlation of fx and fy: pixels are square to a tenth of the focal accuracy."""
-GLASS_INDEX = 0.01
-"""Between kinds of glass, or of acrylic."""
-THICKNESS_SHARE, THICKNESS_M = 0.1, 5e-4
-"""The larger of the two: data sheets promise 10 %, a calliper 0.5 mm."""
-RADIUS_SHARE = 0.02
-"""Of a dome's radius: 1 mm of 50."""
-WATER_INDEX = 0.002
-"""15 degrees of temperature, or 10 g/kg of salt."""
-BASELINE_SHARE = 0.005
-"""1 mm of 200: a stereo calibration, or a careful ruler."""
-NORMAL_DEG = 2.0
-"""RMS angle of a held normal: ports are mounted no better."""
-DISTANCE_SHARE, DISTANCE_M = 0.2, 2e-3
-"""The larger of the two, of a held port distance: the entrance pupil is not visible."""
-CENTER_M = 2e-3
-"""Per coordinate, of a held dome centre: the same."""
-ROTATION_DEG = 0.1
-"""Per axis, of a held cam_from_rig."""
-DIRECTION_DEG = 0.1
-"""Per component, of the direction of its translation."""
 
 _BROWN = ({4: 2, 5: 4, 8: 6}, {9: 2, 10: 4, 11: 6})
 """Lens slots of radial coefficients with the power of the radius: above and below the
@@ -80,7 +69,8 @@ class CameraAccuracy:
     """Standard deviations of one camera's given numbers; None: the default is assumed.
 
     What is refined without a prior is not given: its entry has no effect on estimates
-    and deviations, only on the verdict, for which it is a claim.
+    and deviations, only on the verdict, for which it is a claim. Of what the images
+    hardly determine (`Prior.from_accuracy`: the glass) the entry is the prior.
     """
 
     focal: float | None = None
@@ -175,21 +165,17 @@ def given_accuracy(
         require_stated_once(cameras, rig.baseline_m, rig.covariance)
     if rig.exact:
         cameras = [replace(c, accuracy=_otherwise_exact(c)) for c in cameras]
-        rig = replace(
-            rig, baseline_m=rig.baseline_m or 0.0, water_index=rig.water_index or 0.0
-        )
+        shared: dict[str, Any] = {key: getattr(rig, key) or 0.0 for key in OF_RIG}
+        rig = replace(rig, **shared)
     size = border.BORDER_SIZE
     stddevs = np.zeros((len(cameras), size))
     assumed = np.zeros((len(cameras), size), dtype=bool)
     for c, camera in enumerate(cameras):
-        _lens(camera, stddevs[c], assumed[c])
-        _port(camera, stddevs[c], assumed[c])
-        if camera.port != "none":
-            _set(
-                stddevs[c], assumed[c], border.WATER_INDEX, rig.water_index, WATER_INDEX
-            )
+        row = _Row(camera, rig, stddevs[c], assumed[c])
+        row.lens()
+        row.port()
         if c > 0:
-            _placement(camera, rig, baseline_m, stddevs[c], assumed[c])
+            row.placement(baseline_m)
     covariance = np.diag(stddevs.ravel() ** 2)
     _couple_lenses(cameras, stddevs, covariance)
     _couple_water(cameras, stddevs, covariance)
@@ -214,53 +200,84 @@ def _otherwise_exact(camera: GivenCamera) -> CameraAccuracy:
     return CameraAccuracy(**{**zeros, **given})
 
 
-def _set(
-    stddevs: Array,
-    assumed: NDArray[np.bool_],
-    slot: int | slice,
-    given: float | None,
-    default: float,
-    factor: float = 1.0,
-) -> None:
-    stddevs[slot] = factor * (default if given is None else given)
-    assumed[slot] = given is None
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """The standard deviations of one camera, slot by slot."""
 
+    camera: GivenCamera
+    rig: RigAccuracy
+    stddevs: Array
+    """(BORDER_SIZE,) to be filled."""
+    assumed: NDArray[np.bool_]
+    """(BORDER_SIZE,) to be filled."""
 
-def _lens(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> None:
-    accuracy, lens, first = camera.accuracy, camera.lens, border.FIRST_LENS
-    for slot in (0, 1):
-        _set(stddevs, assumed, first + slot, accuracy.focal, FOCAL, float(lens[slot]))
-    for slot in (2, 3):
-        _set(
-            stddevs,
-            assumed,
-            first + slot,
-            accuracy.principal_point_px,
-            PRINCIPAL_POINT_PX,
-        )
-    coefficients = [slot for slot in camera.slots if slot > 3]
-    given = accuracy.distortion
-    if given is not None and len(given) != len(coefficients):
-        names = ", ".join(camera.param_names[-len(coefficients) :] or ("none",))
-        raise InputError(
-            f"camera {camera.name!r}: accuracy.distortion has {len(given)} values, its "
-            f"lens model has {len(coefficients) or 'no'} coefficients ({names})"
-        )
-    radial = {slot for chain in _radial(camera) for slot in chain}
-    for k, slot in enumerate(coefficients):
-        reach = corner_shift(camera, slot)
-        # A number that moves nothing, as beta of EUCM with alpha zero, is known.
-        radially = CORNER / reach if reach > 0.0 else 0.0
-        default = radially if slot in radial else TANGENTIAL
-        value = None if given is None else given[k]
-        moved = (value or 0.0) * reach
-        if moved > MAX_CORNER:
+    def set(
+        self, slots: int | slice, stated: float | None, default: float, per: float
+    ) -> None:
+        self.stddevs[slots] = per * (default if stated is None else stated)
+        self.assumed[slots] = stated is None
+
+    def parameter(self, parameter: Parameter, value: float = 0.0) -> None:
+        """What is stated of a parameter, or else its default.
+
+        Args:
+            parameter: that the camera has.
+            value: of it, on which its default may depend.
+        """
+        accuracy = parameter.accuracy
+        assert accuracy is not None
+        of = self.rig if accuracy.of_rig else self.camera.accuracy
+        stated: float | None = getattr(of, accuracy.key)
+        default = accuracy.default(value)
+        if not accuracy.relative:
+            self.set(parameter.slots, stated, default, accuracy.per)
+            return
+        for slot in range(parameter.first, parameter.first + parameter.size):
+            scale = float(self.camera.lens[slot - border.FIRST_LENS])
+            self.set(slot, stated, default, scale)
+
+    def port(self) -> None:
+        for parameter in (TILT, CENTER, *OF_PORTS):
+            if self.camera.port in parameter.ports:
+                column = parameter.column
+                row = self.camera.port_row
+                self.parameter(parameter, 0.0 if column is None else float(row[column]))
+
+    def placement(self, baseline_m: float | None) -> None:
+        length = float(np.linalg.norm(self.camera.translation)) or baseline_m or 0.0
+        self.parameter(ROTATION)
+        self.parameter(DIRECTION)
+        self.parameter(BASELINE, length)
+
+    def lens(self) -> None:
+        camera = self.camera
+        self.parameter(FOCAL)
+        self.parameter(PRINCIPAL_POINT)
+        coefficients = [slot for slot in camera.slots if slot > 3]
+        stated = camera.accuracy.distortion
+        if stated is not None and len(stated) != len(coefficients):
+            names = ", ".join(camera.param_names[-len(coefficients) :] or ("none",))
             raise InputError(
-                f"camera {camera.name!r}: accuracy.distortion[{k}] is {value:g}, which "
-                f"would move the image corner by {1e2 * moved:.0f} % of its distance "
-                "from the centre; it is one standard deviation of the coefficient"
+                f"camera {camera.name!r}: accuracy.distortion has {len(stated)} "
+                f"values, its lens model has {len(coefficients) or 'no'} coefficients "
+                f"({names})"
             )
-        _set(stddevs, assumed, first + slot, value, default)
+        radial = {slot for chain in _radial(camera) for slot in chain}
+        for k, slot in enumerate(coefficients):
+            reach = corner_shift(camera, slot)
+            # A number that moves nothing, as beta of EUCM with alpha zero, is known.
+            radially = CORNER / reach if reach > 0.0 else 0.0
+            default = radially if slot in radial else TANGENTIAL
+            value = None if stated is None else stated[k]
+            moved = (value or 0.0) * reach
+            if moved > MAX_CORNER:
+                raise InputError(
+                    f"camera {camera.name!r}: accuracy.distortion[{k}] is {value:g}, "
+                    f"which would move the image corner by {1e2 * moved:.0f} % of its "
+                    "distance from the centre; it is one standard deviation of the "
+                    "coefficient"
+                )
+            self.set(border.FIRST_LENS + slot, value, default, 1.0)
 
 
 def corner_shift(camera: GivenCamera, slot: int) -> float:
@@ -286,46 +303,6 @@ def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
     return float(abs(jac[0, slot])) / corner
 
 
-def _port(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> None:
-    accuracy, row = camera.accuracy, camera.port_row
-    if camera.port == "none":
-        return
-    thickness = max(THICKNESS_SHARE * float(row[4]), THICKNESS_M)
-    _set(stddevs, assumed, border.THICKNESS, accuracy.thickness_m, thickness)
-    _set(stddevs, assumed, border.GLASS_INDEX, accuracy.glass_index, GLASS_INDEX)
-    if camera.port == "dome":
-        radius = RADIUS_SHARE * float(row[3])
-        _set(stddevs, assumed, border.RADIUS, accuracy.radius_m, radius)
-        _set(stddevs, assumed, border.CENTER, accuracy.center_m, CENTER_M)
-        return
-    distance = max(DISTANCE_SHARE * float(row[3]), DISTANCE_M)
-    _set(stddevs, assumed, border.DISTANCE, accuracy.distance_m, distance)
-    # The RMS angle is sqrt(2) of its two components.
-    tilt = float(np.radians(1.0) / np.sqrt(2.0))
-    _set(stddevs, assumed, border.NORMAL, accuracy.normal_deg, NORMAL_DEG, tilt)
-
-
-def _placement(
-    camera: GivenCamera,
-    rig: RigAccuracy,
-    baseline_m: float | None,
-    stddevs: Array,
-    assumed: NDArray[np.bool_],
-) -> None:
-    accuracy, radian = camera.accuracy, float(np.radians(1.0))
-    length = float(np.linalg.norm(camera.translation)) or baseline_m or 0.0
-    _set(stddevs, assumed, border.ROTATION, accuracy.rotation_deg, ROTATION_DEG, radian)
-    _set(
-        stddevs,
-        assumed,
-        border.DIRECTION,
-        accuracy.direction_deg,
-        DIRECTION_DEG,
-        radian,
-    )
-    _set(stddevs, assumed, border.LENGTH, rig.baseline_m, BASELINE_SHARE * length)
-
-
 def _couple_lenses(
     cameras: Sequence[GivenCamera], stddevs: Array, covariance: Array
 ) -> None:
@@ -349,10 +326,13 @@ def _couple_water(
     cameras: Sequence[GivenCamera], stddevs: Array, covariance: Array
 ) -> None:
     """Ports in one water err together."""
-    slot = border.WATER_INDEX
+    slot, column = WATER_INDEX.first, WATER_INDEX.column
     for j, second in enumerate(cameras):
         for i, first in enumerate(cameras[:j]):
-            if second.port != "none" and first.port_row[7] == second.port_row[7]:
+            if (
+                second.port != "none"
+                and first.port_row[column] == second.port_row[column]
+            ):
                 a, b = (k * border.BORDER_SIZE + slot for k in (i, j))
                 both = stddevs[i, slot] * stddevs[j, slot]
                 covariance[a, b] = covariance[b, a] = both

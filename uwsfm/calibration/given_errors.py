@@ -5,18 +5,12 @@ moves the estimate x by dx = -H_xx^-1 H_xp dp: one linearisation answers for all
 with C the covariance of what is given, the estimates' own grows by A C A^T, A = dx/dp.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwsfm.calibration.given_accuracy import (
-    CameraAccuracy,
-    GivenAccuracy,
-    GivenCamera,
-    RigAccuracy,
-    given_accuracy,
-)
+from uwsfm.calibration.assumed import assumed_accuracy
+from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.calibration.priors import lens_priors
 from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance, InAll
@@ -28,11 +22,9 @@ from uwsfm.calibration.uncertainty import (
     likelihood,
 )
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DomePort, NoPort
-from uwsfm.models.refractive import RefractiveCamera
+from uwsfm.models.ports.port import DomePort
 from uwsfm.residuals import border
-from uwsfm.scene import IndexArray, Scene
+from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD, Layout, with_columns
 from uwsfm.solver.levenberg_marquardt import suitable_blas
 from uwsfm.solver.linear import schur
@@ -40,61 +32,6 @@ from uwsfm.solver.linear.quasidefinite import symmetric
 from uwsfm.solver.linear.reduced_factor import coupling_columns, inverse
 from uwsfm.solver.linear.reduction import analyse
 from uwsfm.solver.normal_equations import NormalEquations
-
-
-def camera_as_given(
-    name: str,
-    camera: RefractiveCamera,
-    translation: Array,
-    accuracy: CameraAccuracy | None = None,
-) -> GivenCamera:
-    """What the accuracy of a camera's numbers depends on.
-
-    Args:
-        name: of the camera.
-        camera: with the given lens and port.
-        translation: (3,) of cam_from_rig; zeros if only its length is known.
-        accuracy: None: all of it is assumed.
-
-    Raises:
-        InputError: its lens model can only be unprojected.
-    """
-    port, lens = camera.port, camera.lens  # which refuses other models
-    slots = param_slots(camera.camera.model_name)
-    kind = "dome" if isinstance(port, DomePort) else "flat"
-    return GivenCamera(
-        name=name,
-        lens=lens,
-        param_names=_param_names(slots),
-        slots=slots,
-        size_px=(camera.width, camera.height),
-        port="none" if isinstance(port, NoPort) else kind,  # type: ignore[arg-type]
-        port_row=port.row,
-        translation=translation,
-        accuracy=accuracy or CameraAccuracy(),
-    )
-
-
-_SLOT_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
-
-def _param_names(slots: Sequence[int]) -> tuple[str, ...]:
-    """COLMAP's names of a lens model's parameters."""
-    if 1 in slots:
-        return tuple(_SLOT_NAMES[slot] for slot in slots)
-    names = ["f", "cx", "cy", "k1", "k2"][: len(slots)]
-    return tuple(["f", "cx", "cy", "k"] if len(slots) == 4 else names)
-
-
-def assumed_accuracy(scene: Scene) -> GivenAccuracy:
-    """The defaults, of a scene of which nothing else is known."""
-    cameras = [
-        camera_as_given(f"camera {c}", camera, pose[4:])
-        for c, (camera, pose) in enumerate(
-            zip(scene.cameras, scene.cam_from_rig, strict=True)
-        )
-    ]
-    return given_accuracy(cameras, RigAccuracy())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

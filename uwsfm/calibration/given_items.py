@@ -7,21 +7,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uwsfm.calibration.given_errors import GivenReach
+from uwsfm.calibration.parameter import Parameter
+from uwsfm.calibration.parameters import (
+    BASELINE,
+    CENTER,
+    DIRECTION,
+    DISTORTION,
+    FOCAL,
+    LENS_NAMES,
+    OF_PORTS,
+    PRINCIPAL_POINT,
+    ROTATION,
+    TILT,
+)
+from uwsfm.calibration.problem import port_kind
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import FlatPort, Port
 from uwsfm.residuals import border
-
-_LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_TILT, _DIRECTION = "port tilt towards {}", "direction of the baseline towards {}"
-_PLAIN = {
-    border.LENGTH: ("baseline", 1e3, " mm"),
-    border.DISTANCE: ("port distance", 1e3, " mm"),
-    border.WATER_INDEX: ("water index", 1.0, ""),
-    border.THICKNESS: ("glass thickness", 1e3, " mm"),
-    border.GLASS_INDEX: ("glass index", 1.0, ""),
-    border.RADIUS: ("dome radius", 1e3, " mm"),
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,27 +74,34 @@ _Number = tuple[str, dict[int, float], str]
 def _numbers(
     reach: GivenReach, c: int, port: Port, stddevs: dict[int, float]
 ) -> Iterator[_Number]:
-    state = reach.optimum.state
+    state, kind = reach.optimum.state, port_kind(port)
     pose = state.cam_from_rig[c]
-    for axis, slot in zip("xyz", range(3), strict=True):
-        if slot in stddevs:
-            amount = _degrees(stddevs[slot])
-            yield f"cam_from_rig turned about {axis}", {slot: stddevs[slot]}, amount
-    if border.DIRECTION.start in stddevs:
-        yield from _along_axes(pose[4:], border.DIRECTION, _DIRECTION, stddevs)
-    if isinstance(port, FlatPort) and border.NORMAL.start in stddevs:
-        yield from _along_axes(port.normal, border.NORMAL, _TILT, stddevs)
-    if isinstance(port, DomePort):
-        for axis, slot in zip("xyz", range(6, 9), strict=True):
-            if slot in stddevs:
-                amount = f"+{1e3 * stddevs[slot]:.3g} mm"
-                yield f"dome centre {axis}", {slot: stddevs[slot]}, amount
-    for slot, (what, factor, unit) in _PLAIN.items():
-        dome_centre = slot == border.DISTANCE and isinstance(port, DomePort)
-        if slot in stddevs and not dome_centre:
-            amount = f"+{factor * stddevs[slot]:.3g}{unit}"
-            yield what, {slot: stddevs[slot]}, amount
+    yield from _by_axis(ROTATION, stddevs)
+    if DIRECTION.first in stddevs:
+        yield from _along_axes(pose[4:], DIRECTION, stddevs)
+    if isinstance(port, FlatPort) and TILT.first in stddevs:
+        yield from _along_axes(port.normal, TILT, stddevs)
+    if kind in CENTER.ports:
+        yield from _by_axis(CENTER, stddevs)
+    for parameter in (*OF_PORTS, BASELINE):
+        slot = parameter.first
+        if slot in stddevs and kind in parameter.ports:
+            amount = _amount(parameter, stddevs[slot])
+            yield parameter.name, {slot: stddevs[slot]}, amount
     yield from _lens_numbers(state.lenses[c], stddevs)
+
+
+def _by_axis(parameter: Parameter, stddevs: dict[int, float]) -> Iterator[_Number]:
+    """Steps of three numbers, each along an axis of the camera."""
+    for axis, slot in enumerate(range(parameter.first, parameter.first + 3)):
+        if slot in stddevs:
+            amount = _amount(parameter, stddevs[slot])
+            yield parameter.step.format("xyz"[axis]), {slot: stddevs[slot]}, amount
+
+
+def _amount(parameter: Parameter, stddev: float) -> str:
+    unit = f" {parameter.unit.name}" if parameter.unit.name else ""
+    return f"+{parameter.unit.per * stddev:.3g}{unit}"
 
 
 def _lens_numbers(lens: Array, stddevs: dict[int, float]) -> Iterator[_Number]:
@@ -100,28 +110,26 @@ def _lens_numbers(lens: Array, stddevs: dict[int, float]) -> Iterator[_Number]:
     if focal:
         slot = next(iter(focal))
         share = f"+{100.0 * focal[slot] / float(lens[slot - first]):.3g} %"
-        yield "focal length", focal, share
+        yield FOCAL.name, focal, share
         if len(focal) == 2:
             yield "fx", {first: focal[first]}, share
             yield "fy", {first + 1: focal[first + 1]}, share
-    for k, name in enumerate(_LENS[2:], first + 2):
-        if k in stddevs:
-            unit = " px" if name in ("cx", "cy") else ""
-            yield name, {k: stddevs[k]}, f"+{stddevs[k]:.3g}{unit}"
+    for parameter in (PRINCIPAL_POINT, DISTORTION):
+        for slot in range(parameter.first, parameter.first + parameter.size):
+            if slot in stddevs:
+                amount = _amount(parameter, stddevs[slot])
+                yield LENS_NAMES[slot - first], {slot: stddevs[slot]}, amount
 
 
 def _along_axes(
-    direction: ArrayLike, slots: slice, name: str, stddevs: dict[int, float]
+    direction: ArrayLike, parameter: Parameter, stddevs: dict[int, float]
 ) -> Iterator[_Number]:
     """Steps of a unit vector towards the two camera axes that it is farthest from."""
     unit = np.asarray(direction) / np.linalg.norm(direction)
     basis = unit_vector.tangent_basis(unit)
-    stddev = stddevs[slots.start]
+    first = parameter.first
+    stddev = stddevs[first]
     for axis in np.sort(np.argsort(np.abs(unit))[:2]):
         step = basis[axis] / np.linalg.norm(basis[axis]) * stddev
-        steps = {slots.start: float(step[0]), slots.start + 1: float(step[1])}
-        yield name.format("xyz"[axis]), steps, _degrees(stddev)
-
-
-def _degrees(radians: float) -> str:
-    return f"+{np.degrees(radians):.3g} deg"
+        steps = {first: float(step[0]), first + 1: float(step[1])}
+        yield parameter.step.format("xyz"[axis]), steps, _amount(parameter, stddev)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwsfm.calibration.parameters import DIRECTION, LENS, ROTATION
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
@@ -101,11 +102,9 @@ def require_stated_once(
 
 
 _STATED = {
-    "focal": slice(border.FIRST_LENS, border.FIRST_LENS + 2),
-    "principal_point_px": slice(border.FIRST_LENS + 2, border.FIRST_LENS + 4),
-    "distortion": slice(border.FIRST_LENS + 4, border.LENS.stop),
-    "rotation_deg": border.ROTATION,
-    "direction_deg": border.DIRECTION,
+    each.accuracy.key: each.slots
+    for each in (*LENS, ROTATION, DIRECTION)
+    if each.accuracy is not None
 }
 """Accuracies that a covariance may hold as well, and their slots."""
 

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.length_verdicts import length_verdicts, small_length
+from uwsfm.calibration.parameters import BASELINE, FOCAL, OF_PORTS, WATER_INDEX
+from uwsfm.calibration.prior_verdicts import held_by_priors
+from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
@@ -147,6 +150,7 @@ def verdicts(
         *_distances(result, names, geometry, causes),
         *_tilts(result, names, causes),
         *_centers(result, names, causes),
+        *held_by_priors(result, names),
         *_inseparable(result, names),
     )
 
@@ -319,22 +323,15 @@ def _labels(
     result: CalibrationResult, names: Sequence[str]
 ) -> tuple[list[int], list[tuple[str, str]]]:
     """Columns of the numbers that may be confused, with a kind and a name each."""
-    kinds = {
-        border.DISTANCE: "the port distance of {}",
-        border.WATER_INDEX: "the water index",
-        border.LENGTH: "the baseline of {}",
-        border.FIRST_LENS: "the focal length of {}",
-    }
     columns: list[int] = []
     labels: list[tuple[str, str]] = []
-    for c, name in enumerate(names):
-        for slot, text in kinds.items():
-            if slot == border.DISTANCE and not isinstance(
-                result.scene.ports[c], FlatPort
-            ):
+    for c, (name, port) in enumerate(zip(names, result.scene.ports, strict=True)):
+        for each in (*OF_PORTS, BASELINE, FOCAL):
+            if port_kind(port) not in each.ports:
                 continue
-            column = int(result.covariance.border_cols[c, slot])
+            column = int(result.covariance.border_cols[c, each.first])
             if column != HELD and column not in columns:
                 columns.append(column)
-                labels.append((text, text.format(name)))
+                of = "" if each is WATER_INDEX else f" of {name}"
+                labels.append((each.name, f"the {each.name}{of}"))
     return columns, labels

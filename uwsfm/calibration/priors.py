@@ -3,10 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.assumed import assumed_accuracy
+from uwsfm.calibration.parameter import Parameter
+from uwsfm.calibration.parameters import PARAMETERS
+from uwsfm.calibration.problem import CalibrateOptions, exact_error, port_kind
+from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DOME, FLAT, KIND
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout
@@ -14,8 +18,7 @@ from uwsfm.solver.levenberg_marquardt import Priors, Term
 from uwsfm.solver.normal_equations import NormalEquations
 from uwsfm.solver.state import State
 
-_FX, _FY, _CX, _CY = range(border.FIRST_LENS, border.FIRST_LENS + 4)
-_DISTORTION = slice(_CY + 1, border.BORDER_SIZE)
+_FX, _FY = border.FIRST_LENS, border.FIRST_LENS + 1
 
 
 def border_priors(
@@ -33,27 +36,71 @@ def border_priors(
         None if nothing refined has a prior.
     """
     reference = State.from_scene(scene)
-    stddevs = np.full(columns.shape, np.inf)
-    stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
-    flat, dome = (reference.ports[:, KIND] == kind for kind in (FLAT, DOME))
-    stddevs[flat, border.DISTANCE] = settings.distance_stddev_m or np.inf
-    # The prior is on the angle's two components; its RMS angle is sqrt(2) of one.
-    tilt = np.radians(settings.normal_stddev_deg or np.inf) / np.sqrt(2.0)
-    stddevs[flat, border.NORMAL] = tilt
-    stddevs[dome, border.CENTER] = settings.center_stddev_m or np.inf
-    _, waters = np.unique(columns[:, border.WATER_INDEX], return_index=True)
-    stddevs[waters, border.WATER_INDEX] = settings.water_index_stddev or np.inf
-    relative = settings.focal_stddev or np.inf
-    stddevs[:, [_FX, _FY]] = relative * reference.lenses[:, :2]
-    stddevs[:, [_CX, _CY]] = settings.principal_point_stddev_px or np.inf
-    stddevs[:, _DISTORTION] = settings.distortion_stddev or np.inf
-    shared = columns[:, _FX] == columns[:, _FY]
-    stddevs[shared, _FY] = np.inf  # one focal length, known once
+    stddevs = prior_stddevs(scene, settings, columns)
     weights = np.where(columns != HELD, (sigma_px / stddevs) ** 2, 0.0)
     terms = _correlated(reference, settings, columns, sigma_px)
     if not weights.any() and not terms:
         return None
     return Priors(reference=reference, weights=weights, terms=terms)
+
+
+def prior_stddevs(
+    scene: Scene, settings: CalibrateOptions, columns: IndexArray
+) -> Array:
+    """Standard deviations (C, BORDER_SIZE) of priors, in the units of the border's
+    steps; infinite where nothing is known.
+
+    Args:
+        scene: its values are what is known.
+        settings: how well.
+        columns: (C, BORDER_SIZE) of what is refined.
+
+    Raises:
+        InputError: what is refined is exact, as the accuracy of the rig has it.
+    """
+    stddevs = np.full(columns.shape, np.inf)
+    stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
+    kinds = np.array([port_kind(port) for port in scene.ports])
+    lenses = np.array([camera.lens for camera in scene.cameras])
+    for parameter in PARAMETERS:
+        if parameter.prior is None or parameter.accuracy is None:
+            continue
+        has, known = np.isin(kinds, parameter.ports), settings.prior(parameter)
+        if known is not None:
+            per = parameter.accuracy.per * np.ones((len(kinds), parameter.size))
+            if parameter.accuracy.relative:
+                first = parameter.first - border.FIRST_LENS
+                per = lenses[:, first : first + parameter.size]
+            rows = np.arange(parameter.first, parameter.first + parameter.size)
+            stddevs[np.ix_(has, rows)] = known * per[has]
+        elif parameter.prior.from_accuracy:
+            refined = has & (columns[:, parameter.first] != HELD)
+            if refined.any():
+                _take_accuracy(scene, settings, parameter, refined, stddevs)
+    _, waters = np.unique(columns[:, border.WATER_INDEX], return_index=True)
+    one = np.zeros(len(kinds), dtype=bool)
+    one[waters] = True
+    stddevs[~one, border.WATER_INDEX] = np.inf  # one water, known once
+    shared = columns[:, _FX] == columns[:, _FY]
+    stddevs[shared, _FY] = np.inf  # one focal length, known once
+    return stddevs
+
+
+def _take_accuracy(
+    scene: Scene,
+    settings: CalibrateOptions,
+    parameter: Parameter,
+    refined: NDArray[np.bool_],
+    stddevs: Array,
+) -> None:
+    """Make the accuracy of a parameter the prior of the cameras that refine it."""
+    accuracy = settings.given or assumed_accuracy(scene)
+    own = accuracy.stddevs[:, parameter.first]
+    for c in np.flatnonzero(refined):
+        if not own[c] > 0.0:
+            where = accuracy.names[c] if accuracy.names else f"camera {c}"
+            raise InputError(exact_error(parameter, where))
+        stddevs[c, parameter.slots] = own[c]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

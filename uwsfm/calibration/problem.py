@@ -1,17 +1,20 @@
 """What a calibration is asked to do, and what it reports."""
 
+import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, make_dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwsfm.calibration.choices import DEFAULT_ERRORS, PRIORS, ErrorName, Strategy
+from uwsfm.calibration.choices import DEFAULT_ERRORS, ErrorName, Strategy
 from uwsfm.calibration.given_accuracy import GivenAccuracy
+from uwsfm.calibration.parameter import Parameter, PortKind
+from uwsfm.calibration.parameters import LENS, PARAMETERS, PRIORS
 from uwsfm.errors import InputError
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.ports.port import DomePort, NoPort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
@@ -21,17 +24,45 @@ from uwsfm.solver.losses import LOSS_CODES
 
 PerCamera = bool | tuple[bool, ...]
 
-LENS_PRIORS = PRIORS[4:]
-LENS_PARTS = {
-    "focal": slice(0, 2),
-    "principal_point": slice(2, 4),
-    "distortion": slice(4, NUM_PARAMS),
-}
-"""What of a lens is refined together, and its slots."""
+LENS_PRIORS = tuple(each.prior.field for each in LENS if each.prior is not None)
+LENS_REFINED = tuple(each.refine.field for each in LENS if each.refine is not None)
 
 
+def _fields() -> list[tuple[str, Any, Any]]:
+    """Name, type and default of the options that parameters declare."""
+    flags = [each.refine for each in PARAMETERS if each.refine is not None]
+    return [
+        *((flag.field, PerCamera, field(default=flag.default)) for flag in flags),
+        *((name, float | None, field(default=None)) for name in PRIORS),
+    ]
+
+
+if TYPE_CHECKING:
+
+    class _OfParameters:
+        def __getattr__(self, name: str) -> Any: ...
+else:
+    _OfParameters = make_dataclass(
+        "_OfParameters", _fields(), frozen=True, kw_only=True
+    )
+
+
+def _documented(kind: type["CalibrateOptions"]) -> type["CalibrateOptions"]:
+    """Add the options that parameters declare to the docstring."""
+    lines = [kind.__doc__ or "", "", "Args:"]
+    wrapper = textwrap.TextWrapper(
+        88, initial_indent=4 * " ", subsequent_indent=8 * " "
+    )
+    flags = [(p.refine.field, p.refine.help) for p in PARAMETERS if p.refine]
+    priors = [(p.prior.field, p.prior.help) for p in PARAMETERS if p.prior]
+    lines += [wrapper.fill(f"{name}: {text}") for name, text in (*flags, *priors)]
+    kind.__doc__ = "\n".join(lines)
+    return kind
+
+
+@_documented
 @dataclass(frozen=True, kw_only=True)
-class CalibrateOptions:
+class CalibrateOptions(_OfParameters):
     """Options of `uwsfm.calibrate`."""
 
     loss: str = "cauchy"
@@ -58,41 +89,13 @@ class CalibrateOptions:
     the axis or on the other sheet of the caustic), "point_3d" (metres in space). None:
     the strategy's own, reprojection if joint, virtual_camera in the outer loop if
     nested."""
-    refine_normals: PerCamera = True
-    """Of flat ports."""
-    refine_distances: PerCamera = True
-    """Of flat ports."""
-    refine_centers: PerCamera = True
-    """Of domes, all three coordinates."""
     refine_cam_from_rig: bool = True
     """Rotations and the directions of the translations."""
-    refine_water_index: bool = False
-    """Shared by all ports that start from the same index."""
     separate_water_index: bool = False
     """Every port refines an index of its own."""
-    refine_focal: PerCamera = False
-    """Focal lengths of every camera; they trade against water index and distance."""
-    refine_principal_point: PerCamera = False
-    """Trades against the normal."""
-    refine_distortion: PerCamera = False
-    """All distortion parameters that the camera's model has."""
     baseline_stddev_m: float = 0.0
     """Standard deviation of every baseline length; 0 holds the lengths. They are the
     only source of scale: without them no length is determined."""
-    distance_stddev_m: float | None = None
-    """How well the port distances of the start are known; None: not at all. So for all
-    that follow; they matter for what is refined only."""
-    normal_stddev_deg: float | None = None
-    """Root mean square angle."""
-    center_stddev_m: float | None = None
-    """Per coordinate of the centres of domes."""
-    water_index_stddev: float | None = None
-    focal_stddev: float | None = None
-    """Relative: 1e-3 is 0.1 %."""
-    principal_point_stddev_px: float | None = None
-    """Per coordinate."""
-    distortion_stddev: float | None = None
-    """Of each distortion parameter."""
     given: GivenAccuracy | None = field(default=None, compare=False, repr=False)
     """How well what is held is known, for `Covariance.in_all`, and the correlated prior
     of lenses if it asks for one. None: the defaults, which are assumed."""
@@ -115,6 +118,7 @@ class CalibrateOptions:
                 f"baseline_stddev_m must be >= 0, got {self.baseline_stddev_m}"
             )
         self._check_error()
+        self._check_exact()
 
     @classmethod
     def parsed(cls, options: dict[str, Any]) -> "CalibrateOptions":
@@ -138,8 +142,9 @@ class CalibrateOptions:
                     f"{twice[0]}: the rig file has lens_prior: correlated, which is a "
                     "prior of the lenses already; leave one of the two out"
                 )
-            if any(np.any(getattr(self, f"refine_{name}")) for name in LENS_PARTS):
+            if any(np.any(getattr(self, name)) for name in LENS_REFINED):
                 given.append("lens_prior")
+        given += [each.refine.field for each in self._by_accuracy if each.refine]
         pixels = self.strategy == "joint" and self.error_name == "reprojection"
         if given and not pixels:
             raise InputError(
@@ -148,7 +153,7 @@ class CalibrateOptions:
             )
         if self.error_name == "reprojection":
             return
-        for name in ("refine_focal", "refine_principal_point", "refine_distortion"):
+        for name in LENS_REFINED:
             if np.any(getattr(self, name)):
                 raise InputError(
                     f"{name} needs the reprojection error: in {self.error_name} the "
@@ -172,6 +177,26 @@ class CalibrateOptions:
             )
 
     @property
+    def _by_accuracy(self) -> list[Parameter]:
+        """What is refined with a prior that the accuracy of the rig can be."""
+        return [
+            each
+            for each in PARAMETERS
+            if each.prior is not None
+            and each.prior.from_accuracy
+            and each.refine is not None
+            and np.any(getattr(self, each.refine.field))
+        ]
+
+    def _check_exact(self) -> None:
+        """Refuse to refine what the rig states as exact."""
+        for each in self._by_accuracy:
+            if self.given is None or self.prior(each) is not None:
+                continue
+            if not np.any(self.given.stddevs[:, each.slots] > 0.0):
+                raise InputError(exact_error(each, "the rig"))
+
+    @property
     def error_name(self) -> str:
         """What is minimised; if nested, in the outer loop."""
         return self.error or DEFAULT_ERRORS[self.strategy]
@@ -186,30 +211,22 @@ class CalibrateOptions:
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
         count, ports = len(at_zero), [camera.port for camera in cameras]
-        flat = np.array([isinstance(port, FlatPort) for port in ports])
-        dome = np.array([isinstance(port, DomePort) for port in ports])
-        normals = _per_camera("refine_normals", self.refine_normals, count)
-        distances = _per_camera("refine_distances", self.refine_distances, count)
-        centers = _per_camera("refine_centers", self.refine_centers, count)
+        kinds = np.array([port_kind(port) for port in ports])
         free = np.zeros((count, border.BORDER_SIZE), dtype=bool)
         free[1:, border.ROTATION] = self.refine_cam_from_rig
         free[1:, border.DIRECTION] = self.refine_cam_from_rig
         free[1:, border.LENGTH] = self.baseline_stddev_m > 0.0
-        free[:, border.NORMAL] = (normals & flat)[:, None]
-        free[:, border.DISTANCE] = distances & flat & ~at_zero
-        free[dome, border.CENTER] = centers[dome, None]
-        wanted = np.zeros((count, NUM_PARAMS), dtype=bool)
-        for part, slots in LENS_PARTS.items():
-            name = f"refine_{part}"
-            flags = _per_camera(name, getattr(self, name), count)
-            wanted[:, slots] = flags[:, None]
+        for parameter in PARAMETERS:
+            has = np.isin(kinds, parameter.ports)
+            free[has & self.refines(parameter, count), parameter.slots] = True
+        free[at_zero, border.DISTANCE] = False
         models = [camera.camera.model_name for camera in cameras]
         for c, model in enumerate(models):
-            for slot in param_slots(model):
-                free[c, border.FIRST_LENS + slot] = wanted[c, slot]
+            absent = [k for k in range(NUM_PARAMS) if k not in param_slots(model)]
+            free[c, border.FIRST_LENS + np.array(absent, dtype=np.int64)] = False
         water = self._first_of_water(ports)
         for c, first in enumerate(water):
-            free[c, border.WATER_INDEX] = self.refine_water_index and c == first
+            free[c, border.WATER_INDEX] &= c == first
         columns = np.full(free.shape, HELD, dtype=np.int64)
         columns[free] = np.arange(np.count_nonzero(free))
         for c, first in enumerate(water):
@@ -220,6 +237,20 @@ class CalibrateOptions:
                 fx = columns[c, border.FIRST_LENS]
                 columns[c, border.FIRST_LENS + 1] = fx
         return columns
+
+    def refines(self, parameter: Parameter, count: int) -> NDArray[np.bool_]:
+        """(C,) of which cameras a parameter is to be refined, where they have it."""
+        if parameter.refine is None:
+            return np.zeros(count, dtype=bool)
+        name = parameter.refine.field
+        return _per_camera(name, getattr(self, name), count)
+
+    def prior(self, parameter: Parameter) -> float | None:
+        """What is known of a parameter beforehand, in the unit of its option."""
+        if parameter.prior is None:
+            return None
+        stddev: float | None = getattr(self, parameter.prior.field)
+        return stddev
 
     def _first_of_water(self, ports: Sequence[Port]) -> list[int | None]:
         """The first port that shares each port's water; None: no refraction."""
@@ -232,6 +263,23 @@ class CalibrateOptions:
             else first.setdefault(port.n_water, c)
             for c, port in enumerate(ports)
         ]
+
+
+def exact_error(parameter: Parameter, where: str) -> str:
+    """That what is exact cannot be refined."""
+    assert parameter.refine is not None and parameter.prior is not None
+    return (
+        f"{parameter.refine.field}: the accuracy of {where} states the "
+        f"{parameter.name} as exact; give --prior {parameter.prior.field}=..., or hold "
+        "it"
+    )
+
+
+def port_kind(port: Port) -> PortKind:
+    """What parameters a port has."""
+    if isinstance(port, NoPort):
+        return "none"
+    return "dome" if isinstance(port, DomePort) else "flat"
 
 
 def _one_of(name: str, value: str, allowed: Iterable[str]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.calibration.absolute_constraints import Outside
+from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.priors import border_priors, with_terms
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.result import SolveHistory
@@ -137,6 +138,7 @@ class Run:
                 replace(solved.state, ports=ports), keep, loss, sigma_px
             )
         _check_ports(solved.state)
+        _check_bounds(solved.state, self.columns)
         return solved
 
     def _solve_free(
@@ -291,6 +293,23 @@ class Run:
 def _behind_camera(ports: Array) -> NDArray[np.bool_]:
     """Mask (C,) of the flat ports whose distance is negative."""
     return (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
+
+
+def _check_bounds(state: State, columns: IndexArray) -> None:
+    """Refuse what was refined of the glass or the water and has left its bounds."""
+    for each in OF_PORTS:
+        if each.refine is None or each.refine.flag is None or each.prior is None:
+            continue
+        low, high = each.bounds
+        values = state.ports[:, each.column]
+        free = columns[:, each.first] != HELD
+        for camera in np.flatnonzero(free & ~((low <= values) & (values <= high))):
+            raise UwsfmError(
+                f"the {each.name} of camera number {camera + 1} came out at "
+                f"{values[camera]:.4g} {each.unit.in_files}".rstrip()
+                + f", beyond its bounds, {low:g} to {high:g}: the images do not "
+                f"determine it; give a prior, {each.prior.field}, or hold it"
+            )
 
 
 def _check_ports(state: State) -> None:

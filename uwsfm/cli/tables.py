@@ -145,6 +145,8 @@ def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
             _number(entry[key], "{:.3g}") for key in ("stddev", "stddev_in_all")
         )
         text = f"{entry['value']:.7g} ± {own} from the images, ± {total} in all"
+        if "verdict" in entry:
+            text += f": {entry['verdict']}"
         table.add_row(Text(entry["name"]), text)
 
 

@@ -32,10 +32,10 @@ from uwsfm.report.command import command_line
 from uwsfm.results.files import HOUSING, HOUSING_SUMMARY, SPARSE
 from uwsfm.results.housing import export_housing
 from uwsfm.results.log import job_log
+from uwsfm.results.refined import refined_summary
 from uwsfm.results.summary import (
     errors_summary,
     housing_summary,
-    refined_summary,
     versions,
     write_json,
 )

@@ -18,9 +18,9 @@ from uwsfm.results.files import SUMMARY
 from uwsfm.results.folder import Result, given_rig, open_result, store_judgement
 from uwsfm.results.halves_summary import KEY, halves_numbers
 from uwsfm.results.log import job_log
+from uwsfm.results.refined import refined_summary
 from uwsfm.results.summary import (
     housing_summary,
-    refined_summary,
     scale_summary,
     write_json,
 )

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uwsfm.calibration.problem import CalibrateOptions
+from uwsfm.calibration.parameters import PARAMETERS
+from uwsfm.calibration.problem import LENS_REFINED, CalibrateOptions
 from uwsfm.errors import InputError
 from uwsfm.options.jobs import CalibrateHousingOptions, ReconstructOptions
 from uwsfm.rig.file import load_rig
@@ -82,28 +83,16 @@ def require_effect(fields: Mapping[str, Any]) -> None:
         InputError: one has no effect, or `CalibrateOptions` refuses it.
     """
     options = CalibrateOptions.parsed(dict(fields))
-    refined = {
-        "distance_stddev_m": ("the distance of a port", options.refine_distances),
-        "normal_stddev_deg": ("the normal of a port", options.refine_normals),
-        "center_stddev_m": ("the centre of a dome", options.refine_centers),
-        "water_index_stddev": ("the water index", options.refine_water_index),
-        "focal_stddev": ("the focal length", options.refine_focal),
-        "principal_point_stddev_px": (
-            "the principal point",
-            options.refine_principal_point,
-        ),
-        "distortion_stddev": ("the distortion", options.refine_distortion),
-    }
-    for name, (what, wanted) in refined.items():
-        if getattr(options, name) is not None and not np.any(wanted):
-            raise InputError(f"{name} has no effect: {what} is not refined")
-    lens = (
-        options.refine_focal,
-        options.refine_principal_point,
-        options.refine_distortion,
-    )
+    for each in PARAMETERS:
+        if each.prior is None or each.refine is None:
+            continue
+        wanted = np.any(getattr(options, each.refine.field))
+        if options.prior(each) is not None and not wanted:
+            raise InputError(
+                f"{each.prior.field} has no effect: the {each.name} is not refined"
+            )
     correlated = options.given is not None and options.given.correlated_prior
-    if correlated and not any(np.any(flags) for flags in lens):
+    if correlated and not any(np.any(getattr(options, name)) for name in LENS_REFINED):
         raise InputError(
             "accuracy.lens_prior: correlated has no effect: no lens parameter is "
             "refined; add --refine focal, say, or leave this key out"

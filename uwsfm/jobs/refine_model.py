@@ -36,11 +36,11 @@ from uwsfm.report.command import command_line
 from uwsfm.results.files import HOUSING, SPARSE
 from uwsfm.results.folder import recorded_images
 from uwsfm.results.log import job_log
+from uwsfm.results.refined import refined_summary
 from uwsfm.results.summary import (
     errors_summary,
     housing_summary,
     outside_summary,
-    refined_summary,
     versions,
 )
 from uwsfm.rig.rig import Rig

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar
 
 from uwsfm._base.options import (
     Checked,
@@ -24,7 +24,8 @@ from uwsfm._base.options import (
     unknown,
     value_at,
 )
-from uwsfm.calibration.choices import PRIORS, ErrorName, Refinable, Strategy
+from uwsfm.calibration.choices import ErrorName, Strategy
+from uwsfm.calibration.parameters import PRIORS, REFINABLE, Refinable
 from uwsfm.errors import InputError
 from uwsfm.sfm.options import StartOptions
 
@@ -71,8 +72,8 @@ class AdjustmentOptions(Checked):
 
     refine: tuple[Refinable, ...] = option(
         (),
-        help="Refine this number of the rig, too. May be repeated. Default: the index "
-        "of the water and the lenses are held as given.",
+        help="Refine this number of the rig, too. May be repeated. Default: the glass "
+        "of the ports, the index of the water and the lenses are held as given.",
     )
     prior: Mapping[str, float] = option(
         {},
@@ -80,14 +81,15 @@ class AdjustmentOptions(Checked):
         keys=PRIORS,
         help="Standard deviation of a refined number as it is known before: KEY is "
         f"one of {', '.join(PRIORS)}. focal_stddev is relative: 0.001 is 0.1 %. May be "
-        "repeated. Default: nothing is known.",
+        "repeated. Default: the accuracy of the rig file for the glass; for all else, "
+        "nothing is known.",
     )
     further: Mapping[str, Any] = field(default_factory=dict)
     """Other fields of `CalibrateOptions`, by name: for Python only."""
 
     def as_fields(self) -> dict[str, Any]:
         """All of this as fields of `CalibrateOptions`."""
-        refined = {f"refine_{name.replace('-', '_')}": True for name in self.refine}
+        refined = {REFINABLE[name]: True for name in self.refine}
         return {**refined, **self.prior, **self.further}
 
 
@@ -220,7 +222,7 @@ def _with_fields(
     """
     refine, prior = dict.fromkeys(options.refine), dict(options.prior)
     further = dict(options.further)
-    names = {f"refine_{name.replace('-', '_')}": name for name in get_args(Refinable)}
+    names = {field: flag for flag, field in REFINABLE.items()}
     for name, value in given.items():
         if name in names and isinstance(value, bool):
             further.pop(name, None)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from uwsfm.report.gather import Report
 from uwsfm.report.halves import halves_of, halves_payload
-from uwsfm.report.tables import budget_columns, budget_lines, lengths_note
+from uwsfm.report.tables import budget_columns, budget_lines, held_words, lengths_note
 from uwsfm.report.words import deviation, known_length_rows, position_words
 from uwsfm.results.verdict_summary import plain
 from uwsfm.trust.residuals import FEWEST, CameraResiduals, Profile, Residuals
@@ -67,7 +67,7 @@ def page_of(report: Report) -> str:
         report=report,
         summary=summary,
         written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        water_given=not any("water index" in row["name"] for row in summary["refined"]),
+        held=held_words(summary),
         systematic=_systematic_words(report),
         halves=halves_of(summary),
         known_lengths=known_length_rows(summary),

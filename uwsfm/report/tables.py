@@ -8,6 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm._base.indices import distinct
+from uwsfm.calibration.parameter import Parameter
+from uwsfm.calibration.parameters import (
+    BASELINE,
+    GLASS_INDEX,
+    LENS,
+    OF_PORTS,
+    THICKNESS,
+    WATER_INDEX,
+)
 from uwsfm.calibration.result import Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
@@ -19,6 +28,7 @@ from uwsfm.report.words import (
     tilts_of,
     unit_of,
 )
+from uwsfm.results.refined import listed
 from uwsfm.scene import IndexArray
 
 
@@ -85,7 +95,6 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
                 "xyz", camera["center_m"], both, strict=True
             )
         ]
-        rows.append(_given(group, "dome radius", 1e3 * camera["radius_m"], "mm"))
     else:
         word = camera["normal_verdict"]
         rows = [
@@ -105,11 +114,12 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
                 group, "port distance", camera["distance_m"], known, (unit, scale), word
             )
         )
-    rows.append(_given(group, "glass thickness", 1e3 * camera["thickness_m"], "mm"))
-    rows.append(_given(group, "glass index", camera["glass_index"], ""))
-    if not any(row["name"].startswith("water index") for row in summary["refined"]):
-        rows.append(_given(group, "water index", camera["water_index"], ""))
-    return rows
+    return rows + [
+        _given(group, each, camera)
+        for each in OF_PORTS
+        if each.listed and camera["port"] in each.ports
+        if not was_refined(summary, each, group)
+    ]
 
 
 def _placement(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
@@ -136,23 +146,40 @@ def _refined(summary: dict[str, Any]) -> list[Estimate]:
     """What `refined_summary` lists: its names end in " of CAMERA" or stand alone."""
     rows = []
     for entry in summary["refined"]:
-        name, _, group = entry["name"].partition(" of ")
-        scale, unit = 1.0, ""
-        if group.endswith(" (m)"):
-            group, scale, unit = group[:-4], 1e3, "mm"
-        if name in ("f", "fx", "fy", "cx", "cy"):
-            unit = "px"
+        parameter, name, group = listed(entry["name"])
+        word = "not determined" if entry["stddev"] is None else "refined"
         rows.append(
             _number(
                 group or "all",
                 name,
                 entry["value"],
                 (entry["stddev"], entry["stddev_in_all"]),
-                (unit, scale),
-                "not determined" if entry["stddev"] is None else "refined",
+                (parameter.unit.name, parameter.unit.per),
+                entry.get("verdict", word),
             )
         )
     return rows
+
+
+def was_refined(summary: dict[str, Any], parameter: Parameter, camera: str) -> bool:
+    """Whether a number of a camera, or one that all cameras share, was refined."""
+    return any(
+        of is parameter and group in ("", camera)
+        for of, _, group in (listed(entry["name"]) for entry in summary["refined"])
+    )
+
+
+def held_words(summary: dict[str, Any]) -> str:
+    """What standard deviations from the images take as given."""
+    refined = [listed(entry["name"])[0] for entry in summary["refined"]]
+    lens = any(each in LENS for each in refined)
+    held = ["what is held of the lens in air" if lens else "the lens in air"]
+    glass = [each for each in (THICKNESS, GLASS_INDEX) if each not in refined]
+    held += ["the glass"] if len(glass) == 2 else [f"the {p.name}" for p in glass]
+    held += ["the water index"] if WATER_INDEX not in refined else []
+    if summary["baseline_m"] is not None and BASELINE not in refined:
+        held.append("the baseline")
+    return " and ".join(filter(None, [", ".join(held[:-1]), held[-1]]))
 
 
 def _number(
@@ -174,8 +201,11 @@ def _number(
     return _row(group, name, value_text, (own, total), text, word)
 
 
-def _given(group: str, name: str, value: float, unit: str) -> Estimate:
-    return _row(group, name, f"{value:.6g}", ("-", "-"), unit, "given")
+def _given(group: str, parameter: Parameter, camera: dict[str, Any]) -> Estimate:
+    assert parameter.accuracy is not None
+    unit, value = parameter.unit, camera[parameter.accuracy.key]
+    text = f"{unit.per * value:.6g}"
+    return _row(group, parameter.name, text, ("-", "-"), unit.name, "given")
 
 
 def _row(

@@ -1,18 +1,24 @@
 """housing.yaml: the refined rig, in the format of the rig file."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from uwsfm.calibration.length_verdicts import small_unit
 from uwsfm.calibration.named_covariance import without_names
 from uwsfm.calibration.observability import center_verdict, distance_verdict
+from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.results.refined import RefinedNumber, refined_numbers
 from uwsfm.results.verdict_summary import shown_word
 from uwsfm.rig.file import dump_rig
 from uwsfm.rig.rig import Rig, RigCamera
+from uwsfm.solver.layout import HELD
 from uwsfm.trust.verdict import FITS
 
 GIVEN = """The rig as given for this result, before anything was refined."""
@@ -50,7 +56,11 @@ def export_housing(
             camera.name: _comments(rig, calibration, index, verdict)
             for index, camera in enumerate(rig.cameras)
         }
-        rig = replace(_with_accuracy(rig, calibration), verdict=verdict)
+        glass = _glass(rig, calibration)
+        for number in glass:
+            lines = comments[rig.cameras[number.camera].name]
+            lines.append(_comment(number, verdict))
+        rig = replace(_with_accuracy(rig, calibration, glass), verdict=verdict)
     dump_rig(
         rig,
         path,
@@ -61,7 +71,30 @@ def export_housing(
     )
 
 
-def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
+def _glass(rig: Rig, calibration: CalibrationResult) -> list[RefinedNumber]:
+    """Refined numbers whose accuracy was their prior, and is better known now."""
+    columns = calibration.covariance.border_cols
+    kinds = [each for each in OF_PORTS if each.prior and each.prior.from_accuracy]
+    if not any(np.any(columns[:, each.first] != HELD) for each in kinds):
+        return []
+    return [n for n in refined_numbers(rig, calibration) if n.parameter in kinds]
+
+
+def _comment(number: RefinedNumber, verdict: str) -> str:
+    unit = number.parameter.unit
+    own, total = (
+        f"{unit.per * value:.4g} {unit.name}".rstrip()
+        for value in (number.stddev, number.stddev_in_all)
+    )
+    return (
+        f"{number.parameter.name}: standard deviation {own} from the images and the "
+        f"prior, {total} in all: {shown_word(number.verdict or '', verdict)}"
+    )
+
+
+def _with_accuracy(
+    rig: Rig, calibration: CalibrationResult, glass: Sequence[RefinedNumber]
+) -> Rig:
     """The rig with what is known of its estimates, for whoever holds them next."""
     known = calibration.covariance.judged_cameras
     turned = calibration.options.refine_cam_from_rig
@@ -78,6 +111,9 @@ def _with_accuracy(rig: Rig, calibration: CalibrationResult) -> Rig:
             found["rotation_deg"] = cov.rotation_stddev_deg / math.sqrt(3.0)
             if covariance is not None:  # which was of the rotation before
                 covariance = without_names(covariance, f"{camera.name}.rotation_")
+        for number in glass:
+            if number.camera == c and number.parameter.accuracy is not None:
+                found[number.parameter.accuracy.key] = number.stddev_in_all
         digits: dict[str, Any] = {
             key: float(f"{value:.4g}")
             for key, value in found.items()

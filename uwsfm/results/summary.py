@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from uwsfm._base.files import replaced_file
-from uwsfm.calibration.enlarged import column_factors
 from uwsfm.calibration.error_budget import BudgetRow
 from uwsfm.calibration.length_verdicts import scale_verdict, small_unit
 from uwsfm.calibration.lengths import LengthFit, PositionFit
@@ -21,16 +20,11 @@ from uwsfm.calibration.observability import (
     distance_verdict,
     normal_verdict,
 )
-from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
-from uwsfm.calibration.uncertainty import border_covariance
-from uwsfm.models.lens import param_slots
 from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
-from uwsfm.residuals import border
 from uwsfm.rig.rig import Rig, RigCamera
 from uwsfm.scene import Scene
-from uwsfm.solver.layout import HELD
 
 PACKAGES = (
     "uwsfm",
@@ -230,56 +224,6 @@ def _positions_summary(
         "turn_stddev_deg": math.degrees(turn),
         "turn_axis": axis.tolist(),
     }
-
-
-def refined_summary(rig: Rig, calibration: CalibrationResult) -> list[dict[str, Any]]:
-    """Estimates beside ports and placement: water, baselines, lenses."""
-    covariance, scene = calibration.covariance, calibration.scene
-    if not _refines_more(calibration):
-        return []
-    # As of ports: what neighbouring features share is in it.
-    grow = column_factors(covariance, scene.ports, covariance.enlarged)
-    variances = grow**2 * np.diag(border_covariance(reopened(calibration)))
-    stddevs = in_all = np.sqrt(np.append(variances, np.nan))
-    if covariance.in_all is not None:
-        added = np.diag(covariance.in_all.border) - np.diag(covariance.border)
-        in_all = np.sqrt(np.append(variances + added, np.nan))
-    entries = []
-
-    def add(name: str, camera: int, slot: int, value: float) -> None:
-        column = int(covariance.border_cols[camera, slot])
-        if column != HELD:
-            stddev = _stddev(float(stddevs[column]), True)
-            entries.append(
-                {
-                    "name": name,
-                    "value": value,
-                    "stddev": stddev,
-                    "stddev_in_all": _stddev(float(in_all[column]), True),
-                }
-            )
-
-    waters = calibration.covariance.border_cols[:, border.WATER_INDEX]
-    for c in [c for c in range(len(waters)) if waters[c] not in waters[:c]]:
-        name = "water index" if len({*waters} - {HELD}) == 1 else "water index at {}"
-        text = name.format(rig.cameras[c].name)
-        add(text, c, border.WATER_INDEX, scene.ports[c].n_water)
-    for c, item in enumerate(rig.cameras):
-        length = float(np.linalg.norm(scene.cam_from_rig[c, 4:]))
-        add(f"baseline of {item.name} (m)", c, border.LENGTH, length)
-        lens = scene.cameras[c].camera
-        names = item.camera.params_info.split(", ")
-        slots = param_slots(lens.model_name)
-        for name, slot, value in zip(names, slots, lens.params, strict=True):
-            text = f"{name} of {item.name}"
-            add(text, c, border.FIRST_LENS + slot, float(value))
-    return entries
-
-
-def _refines_more(calibration: CalibrationResult) -> bool:
-    """Whether anything but ports, and directions of the placement, was refined."""
-    slots = [border.WATER_INDEX, border.LENGTH, *range(*border.LENS.indices(10**3))]
-    return bool(np.any(calibration.covariance.border_cols[:, slots] != HELD))
 
 
 def budget_summary(

@@ -55,7 +55,17 @@ def with_verdict(verdict: Verdict, summary: Mapping[str, Any]) -> dict[str, Any]
     }
     rest = {key: value for key, value in summary.items() if key not in first}
     shown = {**scale, "verdict": shown_word(scale["verdict"], word)}
-    return {**first, **rest, "cameras": cameras, "scale": shown}
+    shown_parts: dict[str, Any] = {"cameras": cameras, "scale": shown}
+    if "refined" in summary:
+        shown_parts["refined"] = [_shown_row(row, word) for row in summary["refined"]]
+    return {**first, **rest, **shown_parts}
+
+
+def _shown_row(row: dict[str, Any], verdict: str) -> dict[str, Any]:
+    """An estimate of a list, whose word claims no more than the verdict."""
+    if "verdict" not in row:
+        return row
+    return {**row, "verdict": shown_word(row["verdict"], verdict)}
 
 
 def verdict_line(summary: Mapping[str, Any]) -> str:

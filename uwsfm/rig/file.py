@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from uwsfm._base.files import replaced_file
 from uwsfm._base.yaml import read_yaml
 from uwsfm.calibration.given_accuracy import RigAccuracy
+from uwsfm.calibration.parameters import OF_RIG
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
 from uwsfm.models.ports.port import DomePort, NoPort, Port
@@ -291,7 +292,7 @@ def _shared_accuracy(accuracy: RigAccuracy) -> dict[str, Any]:
     if accuracy.exact:
         return {"accuracy": "exact"}
     found: dict[str, Any] = {}
-    for key in ("baseline_m", "water_index"):
+    for key in OF_RIG:
         if getattr(accuracy, key) is not None:
             found[key] = getattr(accuracy, key)
     if accuracy.covariance is not None:

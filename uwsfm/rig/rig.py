@@ -198,7 +198,7 @@ class Rig:
 
     def cameras_as_given(self) -> tuple[GivenCamera, ...]:
         """What the accuracies of each camera's numbers depend on."""
-        from uwsfm.calibration.given_errors import camera_as_given
+        from uwsfm.calibration.assumed import camera_as_given
 
         poses = self.cam_from_rig
         return tuple(

@@ -11,6 +11,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 
 import numpy as np
 
+from uwsfm.calibration.parameters import PARAMETERS
 from uwsfm.errors import InputError
 
 UNIT_TOLERANCE = 1e-9
@@ -139,18 +140,9 @@ def checked_folder(value: str) -> str:
 
 
 ACCURACIES: dict[str, tuple[float, str]] = {
-    "focal": (0.1, "as a share of the focal length: 0.001 is 0.1 %"),
-    "principal_point_px": (500.0, "in pixels"),
-    "thickness_m": (0.02, "in metres: 0.0005 is half a millimetre"),
-    "radius_m": (0.05, "in metres: 0.001 is a millimetre"),
-    "glass_index": (0.3, "in units of the index"),
-    "water_index": (0.1, "in units of the index"),
-    "normal_deg": (45.0, "in degrees"),
-    "distance_m": (0.2, "in metres: 0.002 is two millimetres"),
-    "center_m": (0.1, "in metres: 0.002 is two millimetres"),
-    "rotation_deg": (45.0, "in degrees"),
-    "direction_deg": (45.0, "in degrees"),
-    "baseline_m": (1.0, "in metres: 0.001 is a millimetre"),
+    each.accuracy.key: (each.accuracy.most, each.accuracy.unit)
+    for each in PARAMETERS
+    if each.accuracy is not None and math.isfinite(each.accuracy.most)
 }
 """Accuracies that a person may state: what each stays below, and its unit. Per cent,
 pixels or millimetres in the place of that unit lie beyond. Distortion coefficients have

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.trust.given import Departure
 from uwsfm.trust.reason import DOES_NOT_FIT, DOUBTFUL, Reason, reason
 
@@ -35,6 +36,8 @@ def departed_reasons(departures: Sequence[Departure]) -> list[Reason]:
         "distances_share": _distances,
         "tilt_deg": _tilt,
         "center_share": _dome,
+        "thickness_m": _glass,
+        "glass_index": _glass,
         "focal_share": _focal,
         "principal_point_px": _principal_point,
         "stretch": _stretch,
@@ -45,6 +48,27 @@ def departed_reasons(departures: Sequence[Departure]) -> list[Reason]:
     if any(item.code == "port_distance" for item in reasons):
         return [item for item in reasons if item.code != "port_distances"]
     return reasons
+
+
+def _glass(item: Departure) -> Reason | None:
+    """A number of the glass against its prior, which pulls on it."""
+    if item.z < CONTRADICTED:
+        return None
+    each = next(p for p in OF_PORTS if p.accuracy and p.accuracy.key == item.what)
+    unit, per = f" {each.unit.name}".rstrip(), each.unit.per
+    found, known = (
+        f"{per * value:.5g} ± {per * stddev:.2g}{unit}"
+        for value, stddev in (
+            (item.estimate, item.stddev),
+            (item.given, item.given_stddev),
+        )
+    )
+    source = "as given" if item.stated else "an accuracy that is assumed"
+    text = (
+        f"Camera {item.camera}: the {each.name} came out at {found}, against {known}, "
+        f"{source}; measure it, and check the port distance, the lens and units."
+    )
+    return reason("glass", text, DOUBTFUL, **_numbers(item))
 
 
 def _numbers(item: Departure) -> dict[str, float]:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from uwsfm._base.progress import Progress, silent
-from uwsfm.calibration.problem import PRIORS, CalibrateOptions
+from uwsfm.calibration.parameters import PRIORS, REFINABLE
+from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.models.ports.port import DomePort, FlatPort
 from uwsfm.rig.rig import Rig
@@ -96,14 +97,7 @@ def options_of(calibration: CalibrationResult) -> dict[str, Any]:
     return {name: value for name, value in pairs if value != getattr(plain, name)}
 
 
-KEPT = (
-    *PRIORS,
-    "refine_focal",
-    "refine_principal_point",
-    "refine_distortion",
-    "refine_water_index",
-    "separate_water_index",
-)
+KEPT = (*PRIORS, *REFINABLE.values(), "separate_water_index")
 """Fields of `CalibrateOptions` that a trial takes over from the result."""
 
 

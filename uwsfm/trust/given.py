@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwsfm.calibration.parameters import OF_PORTS
+from uwsfm.calibration.priors import prior_stddevs
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import BROWN, KIND, NUM_PARAMS, PINHOLE
@@ -46,9 +48,9 @@ class Departure:
     camera: str
     what: str
     """"distance_m", "distances_share" (of all ports together, 1: as given),
-    "tilt_deg", "center_share" (of the dome's radius), "focal_share",
-    "principal_point_px", "stretch" (of the distortion at the image's edge, 1: none),
-    "unseen_share" (of the image's edge, where the lens has no ray)"""
+    "tilt_deg", "center_share" (of the dome's radius), "thickness_m", "glass_index",
+    "focal_share", "principal_point_px", "stretch" (of the distortion at the image's
+    edge, 1: none), "unseen_share" (of the image's edge, where the lens has no ray)"""
     given: float
     estimate: float
     stddev: float
@@ -84,6 +86,7 @@ def departures(rig: Rig, calibration: CalibrationResult) -> tuple[Departure, ...
         refined = calibration.covariance.border_cols[index] != HELD
         after = calibration.scene.cameras[index]
         found += _port(camera, after.port, index, refined, calibration, metric)
+        found += _glass(camera, after.port, index, calibration)
         if np.any(refined[border.FIRST_LENS :]):
             found += _lens(camera, after, index, calibration)
     return (*found, *_common_factor(rig, calibration, found))
@@ -223,6 +226,33 @@ def _port(
                 estimate=float(np.linalg.norm(after.center)) / after.radius,
                 stddev=float(np.linalg.norm(cov.center_stddev_m)) / after.radius,
                 given_stddev=(stated or CENTER_SHARE * after.radius) / after.radius,
+                stated=stated is not None,
+            )
+        )
+    return found
+
+
+def _glass(
+    camera: RigCamera, after: Port, index: int, calibration: CalibrationResult
+) -> list[Departure]:
+    """What has its accuracy as a prior, and the images pull away from it."""
+    covariance, found = calibration.covariance, []
+    for each in OF_PORTS:
+        column = int(covariance.border_cols[index, each.first])
+        by_accuracy = each.prior is not None and each.prior.from_accuracy
+        if column == HELD or not by_accuracy or each.accuracy is None:
+            continue
+        columns = covariance.border_cols
+        prior = prior_stddevs(calibration.scene, calibration.options, columns)
+        stated = getattr(camera.accuracy, each.accuracy.key)
+        found.append(
+            Departure(
+                camera=camera.name,
+                what=each.accuracy.key,
+                given=float(camera.port.row[each.column]),
+                estimate=float(after.row[each.column]),
+                stddev=float(np.sqrt(covariance.border[column, column])),
+                given_stddev=float(prior[index, each.first]),
                 stated=stated is not None,
             )
         )

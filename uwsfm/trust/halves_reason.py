@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from uwsfm.calibration.parameters import GROUPS
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.trust.halves import (
     MIN_FRAMES,
@@ -15,18 +16,7 @@ FAR_APART = 3.0
 """Times the prediction, and significant. Up to it, deviations are enlarged and that is
 all: a real rig in a tank has 1.3 to 2.1, as its lens fits badly; a port that was
 mounted anew midway, 10 mm farther away, has more."""
-NAMES = {
-    "tilt": "port tilts",
-    "distance": "port distances",
-    "center": "dome centres",
-    "rotation": "rotations of cam_from_rig",
-    "direction": "directions of the baselines",
-    "baseline": "lengths of the baselines",
-    "water index": "water indices",
-    "lens": "lenses",
-    "length": "distances between points",
-    "scale": "scale",
-}
+NAMES = {**GROUPS, "length": "distances between points", "scale": "scale"}
 """Groups of numbers that halves are compared by, for people."""
 
 

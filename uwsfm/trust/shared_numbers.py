@@ -8,18 +8,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwsfm.calibration.given_errors import GivenReach, given_reach
+from uwsfm.calibration.parameter import Parameter
+from uwsfm.calibration.parameters import (
+    BASELINE,
+    CENTER,
+    DIRECTION,
+    DISTANCE,
+    LENS_NAMES,
+    OF_PORTS,
+    ROTATION,
+    TILT,
+    lens_parameter,
+)
+from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, FlatPort, Port
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD
-
-LENS_NAMES = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
-"""As the slots of `uwsfm.residuals.border.LENS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +37,7 @@ class SharedNumber:
     """One number of the rig, its ports or lenses, by two calibrations."""
 
     group: str
-    """Numbers that are judged together: "tilt", "distance", "center", "rotation",
-    "direction", "baseline", "water index" or "lens"."""
+    """Numbers that are judged together: a `Parameter.group`."""
     name: str
     camera: int
     unit: str
@@ -200,28 +209,21 @@ def _readings(
         normals = np.array([port.normal for port in flat])
         basis = unit_vector.tangent_basis(normals[0])
         level = np.sqrt(1.0 - normals[0, :2] ** 2)
-        yield _Reading(
-            "tilt",
-            ("tilt x", "tilt y"),
-            "deg",
+        yield _several(
+            TILT,
+            "xy",
             np.degrees(np.arcsin(normals[:, :2])),
-            border.NORMAL,
             np.degrees(basis[:2] / level[:, None]),
         )
-        distances = np.array([[1e3 * port.distance] for port in flat])
-        yield _single("distance", "port distance", "mm", distances, border.DISTANCE)
+        yield _of_port(DISTANCE, ports)
     if len(domes) == 2:
-        yield _Reading(
-            "center",
-            ("centre x", "centre y", "centre z"),
-            "mm",
-            1e3 * np.array([port.center for port in domes]),
-            border.CENTER,
-            1e3 * np.eye(3),
-        )
+        centers = 1e3 * np.array([port.center for port in domes])
+        yield _several(CENTER, "xyz", centers, 1e3 * np.eye(3))
     yield from _placement(both, camera)
-    water = np.array([[port.n_water] for port in ports])
-    yield _single("water index", "water index", "", water, border.WATER_INDEX)
+    for parameter in OF_PORTS:
+        has = all(port_kind(port) in parameter.ports for port in ports)
+        if has and parameter is not DISTANCE:
+            yield _of_port(parameter, ports)
     yield from _lens(both, camera)
 
 
@@ -233,26 +235,14 @@ def _placement(
     poses = np.array([result.scene.cam_from_rig[camera] for result in both])
     turn = rigid3.compose(poses[1], rigid3.inverse(poses[0]))
     turned = np.degrees(rigid3.rotvec_from_quat(turn[:4]))
-    yield _Reading(
-        "rotation",
-        ("rotation x", "rotation y", "rotation z"),
-        "deg",
-        np.array([np.zeros(3), turned]),  # against that of the first
-        border.ROTATION,
-        np.degrees(np.eye(3)),
-    )
+    against_first = np.array([np.zeros(3), turned])
+    yield _several(ROTATION, "xyz", against_first, np.degrees(np.eye(3)))
     lengths = np.linalg.norm(poses[:, 4:], axis=1)
     directions = poses[:, 4:] / lengths[:, None]
     basis = unit_vector.tangent_basis(directions[0])
-    yield _Reading(
-        "direction",
-        ("baseline direction 1", "baseline direction 2"),
-        "deg",
-        np.degrees((directions - directions[0]) @ basis),
-        border.DIRECTION,
-        np.degrees(np.eye(2)),
-    )
-    yield _single("baseline", "baseline", "mm", 1e3 * lengths[:, None], border.LENGTH)
+    turns = np.degrees((directions - directions[0]) @ basis)
+    yield _several(DIRECTION, "12", turns, np.degrees(np.eye(2)))
+    yield _single(BASELINE, lengths)
 
 
 def _lens(
@@ -260,14 +250,41 @@ def _lens(
 ) -> Iterator[_Reading]:
     lenses = [result.scene.cameras[camera].camera for result in both]
     for index, slot in enumerate(param_slots(lenses[0].model_name)):
-        values = np.array([[float(lens.params[index])] for lens in lenses])
-        unit = "px" if slot < 4 else ""
+        values = np.array([float(lens.params[index]) for lens in lenses])
         place = border.FIRST_LENS + slot
-        yield _single("lens", LENS_NAMES[slot], unit, values, place)
+        yield _single(lens_parameter(place), values, LENS_NAMES[slot], place)
 
 
-def _single(group: str, name: str, unit: str, values: Array, slot: int) -> _Reading:
-    scale = 1e3 if unit == "mm" else 1.0
+def _several(parameter: Parameter, axes: str, values: Array, slope: Array) -> _Reading:
+    """Numbers of one parameter, in its unit."""
+    names = tuple(parameter.part.format(axis) for axis in axes)
+    slots = slice(parameter.first, parameter.first + parameter.size)
+    unit = parameter.unit.name
+    return _Reading(parameter.group, names, unit, values, slots, slope)
+
+
+def _of_port(parameter: Parameter, ports: Sequence[Port]) -> _Reading:
+    values = np.array([port.row[parameter.column] for port in ports])
+    return _single(parameter, values)
+
+
+def _single(
+    parameter: Parameter, values: Array, name: str = "", slot: int | None = None
+) -> _Reading:
+    """One number, or one of a lens.
+
+    Args:
+        parameter: that it is of.
+        values: (2,) in memory.
+        name: of one of several.
+        slot: of the same.
+    """
+    first, unit = parameter.first if slot is None else slot, parameter.unit
     return _Reading(
-        group, (name,), unit, values, slice(slot, slot + 1), np.array([[scale]])
+        parameter.group,
+        (name or parameter.name,),
+        unit.name,
+        unit.per * values[:, None],
+        slice(first, first + 1),
+        np.array([[unit.per]]),
     )
