@@ -17,7 +17,7 @@ from uwsfm.calibration.result import (
     InAll,
 )
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 
@@ -28,7 +28,7 @@ _SHARED: dict[str, int | slice] = {
     "water index": border.WATER_INDEX,
     "lens": border.LENS,
 }
-_FLAT: dict[str, int | slice] = {"tilt": border.NORMAL, "distance": border.DISTANCE}
+_PLANE: dict[str, int | slice] = {"tilt": border.NORMAL, "distance": border.DISTANCE}
 _DOME: dict[str, int | slice] = {"center": border.CENTER}
 
 
@@ -72,9 +72,9 @@ def column_factors(
     grow = np.ones(len(covariance.border))
     for columns, port in zip(covariance.border_cols, ports, strict=True):
         slots = dict(_SHARED)
-        if isinstance(port, FlatPort):
-            slots |= _FLAT
-        elif isinstance(port, DomePort):
+        if port.has("normal"):
+            slots |= _PLANE
+        if port.has("center"):
             slots |= _DOME
         for group, slot in slots.items():
             some = np.atleast_1d(columns[slot])

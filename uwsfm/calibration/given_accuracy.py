@@ -19,6 +19,9 @@ from uwsfm.calibration.named_covariance import (
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import CX, CY, FX
+from uwsfm.models.ports.kind import Port
+from uwsfm.models.ports.row import DISTANCE, N_WATER, RADIUS, THICKNESS
 from uwsfm.residuals import border
 
 FOCAL = 1e-3
@@ -150,7 +153,7 @@ class GivenCamera:
     slots: tuple[int, ...]
     """Where each parameter of the lens model is in ``lens``."""
     size_px: tuple[int, int]
-    port: Literal["flat", "dome", "none"]
+    port: type[Port]
     port_row: Array
     translation: Array
     """(3,) of cam_from_rig; zeros if only its length is known."""
@@ -184,7 +187,7 @@ def given_accuracy(
     for c, camera in enumerate(cameras):
         _lens(camera, stddevs[c], assumed[c])
         _port(camera, stddevs[c], assumed[c])
-        if camera.port != "none":
+        if camera.port.refracts:
             _set(
                 stddevs[c], assumed[c], border.WATER_INDEX, rig.water_index, WATER_INDEX
             )
@@ -269,7 +272,7 @@ def corner_shift(camera: GivenCamera, slot: int) -> float:
     if _radial(camera) is _SHAPE:
         return _shape_shift(camera.lens, camera.size_px, slot)
     powers = {slot: power for chain in _radial(camera) for slot, power in chain.items()}
-    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[0])
+    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[FX])
     return corner ** powers.get(slot, 2)
 
 
@@ -278,9 +281,9 @@ def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
     from uwsfm.models.lens import NUM_PARAMS, dir_from_img, jac_by_params
 
     corner = float(np.hypot(*size_px)) / 2.0
-    x, _, z = dir_from_img(lens[2] + corner, lens[3], lens)
+    x, _, z = dir_from_img(lens[CX] + corner, lens[CY], lens)
     if not z > 0.0:  # as far as it sees
-        x, _, z = dir_from_img(lens[2] + 0.5 * min(size_px), lens[3], lens)
+        x, _, z = dir_from_img(lens[CX] + 0.5 * min(size_px), lens[CY], lens)
     jac = np.empty((2, NUM_PARAMS))
     jac_by_params(x / z, 0.0, lens, jac)
     return float(abs(jac[0, slot])) / corner
@@ -288,21 +291,23 @@ def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
 
 def _port(camera: GivenCamera, stddevs: Array, assumed: NDArray[np.bool_]) -> None:
     accuracy, row = camera.accuracy, camera.port_row
-    if camera.port == "none":
-        return
-    thickness = max(THICKNESS_SHARE * float(row[4]), THICKNESS_M)
-    _set(stddevs, assumed, border.THICKNESS, accuracy.thickness_m, thickness)
-    _set(stddevs, assumed, border.GLASS_INDEX, accuracy.glass_index, GLASS_INDEX)
-    if camera.port == "dome":
-        radius = RADIUS_SHARE * float(row[3])
+    kind = camera.port
+    if kind.has("thickness"):
+        thickness = max(THICKNESS_SHARE * float(row[THICKNESS]), THICKNESS_M)
+        _set(stddevs, assumed, border.THICKNESS, accuracy.thickness_m, thickness)
+        _set(stddevs, assumed, border.GLASS_INDEX, accuracy.glass_index, GLASS_INDEX)
+    if kind.has("radius"):
+        radius = RADIUS_SHARE * float(row[RADIUS])
         _set(stddevs, assumed, border.RADIUS, accuracy.radius_m, radius)
+    if kind.has("center"):
         _set(stddevs, assumed, border.CENTER, accuracy.center_m, CENTER_M)
-        return
-    distance = max(DISTANCE_SHARE * float(row[3]), DISTANCE_M)
-    _set(stddevs, assumed, border.DISTANCE, accuracy.distance_m, distance)
-    # The RMS angle is sqrt(2) of its two components.
-    tilt = float(np.radians(1.0) / np.sqrt(2.0))
-    _set(stddevs, assumed, border.NORMAL, accuracy.normal_deg, NORMAL_DEG, tilt)
+    if kind.has("distance"):
+        distance = max(DISTANCE_SHARE * float(row[DISTANCE]), DISTANCE_M)
+        _set(stddevs, assumed, border.DISTANCE, accuracy.distance_m, distance)
+    if kind.has("normal"):
+        # The RMS angle is sqrt(2) of its two components.
+        tilt = float(np.radians(1.0) / np.sqrt(2.0))
+        _set(stddevs, assumed, border.NORMAL, accuracy.normal_deg, NORMAL_DEG, tilt)
 
 
 def _placement(
@@ -352,7 +357,10 @@ def _couple_water(
     slot = border.WATER_INDEX
     for j, second in enumerate(cameras):
         for i, first in enumerate(cameras[:j]):
-            if second.port != "none" and first.port_row[7] == second.port_row[7]:
+            if (
+                second.port.refracts
+                and first.port_row[N_WATER] == second.port_row[N_WATER]
+            ):
                 a, b = (k * border.BORDER_SIZE + slot for k in (i, j))
                 both = stddevs[i, slot] * stddevs[j, slot]
                 covariance[a, b] = covariance[b, a] = both

@@ -29,7 +29,6 @@ from uwsfm.calibration.uncertainty import (
 )
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DomePort, NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
@@ -61,14 +60,13 @@ def camera_as_given(
     """
     port, lens = camera.port, camera.lens  # which refuses other models
     slots = param_slots(camera.camera.model_name)
-    kind = "dome" if isinstance(port, DomePort) else "flat"
     return GivenCamera(
         name=name,
         lens=lens,
         param_names=_param_names(slots),
         slots=slots,
         size_px=(camera.width, camera.height),
-        port="none" if isinstance(port, NoPort) else kind,  # type: ignore[arg-type]
+        port=type(port),
         port_row=port.row,
         translation=translation,
         accuracy=accuracy or CameraAccuracy(),
@@ -284,7 +282,7 @@ def in_all(calibration: CalibrationResult, reach: GivenReach) -> InAll:
     for c, (own, pose) in enumerate(
         zip(covariance.cameras, calibration.scene.cam_from_rig, strict=True)
     ):
-        dome = isinstance(calibration.scene.ports[c], DomePort)
+        dome = calibration.scene.ports[c].has("center")
         more = camera_variances(added, every[c], pose, dome)
         total = _variances(own) + np.clip(more, 0.0, None)
         cameras.append(camera_covariance(total, own.distance_at_zero))

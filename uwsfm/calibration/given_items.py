@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from uwsfm.calibration.given_errors import GivenReach
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import PlanePort, Port
 from uwsfm.residuals import border
 
 _LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -79,15 +79,15 @@ def _numbers(
             yield f"cam_from_rig turned about {axis}", {slot: stddevs[slot]}, amount
     if border.DIRECTION.start in stddevs:
         yield from _along_axes(pose[4:], border.DIRECTION, _DIRECTION, stddevs)
-    if isinstance(port, FlatPort) and border.NORMAL.start in stddevs:
+    if isinstance(port, PlanePort) and border.NORMAL.start in stddevs:
         yield from _along_axes(port.normal, border.NORMAL, _TILT, stddevs)
-    if isinstance(port, DomePort):
+    if port.has("center"):
         for axis, slot in zip("xyz", range(6, 9), strict=True):
             if slot in stddevs:
                 amount = f"+{1e3 * stddevs[slot]:.3g} mm"
                 yield f"dome centre {axis}", {slot: stddevs[slot]}, amount
     for slot, (what, factor, unit) in _PLAIN.items():
-        dome_centre = slot == border.DISTANCE and isinstance(port, DomePort)
+        dome_centre = slot == border.DISTANCE and port.has("center")
         if slot in stddevs and not dome_centre:
             amount = f"+{factor * stddevs[slot]:.3g}{unit}"
             yield what, {slot: stddevs[slot]}, amount

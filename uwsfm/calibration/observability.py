@@ -17,7 +17,7 @@ from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD
@@ -185,8 +185,8 @@ def _distances(
 ) -> list[str]:
     """The weak directions of the port distances, weakest first."""
     covariance = result.covariance
-    flat = [isinstance(port, FlatPort) for port in result.scene.ports]
-    cols = np.where(flat, covariance.border_cols[:, border.DISTANCE], HELD)
+    with_one = [port.has("distance") for port in result.scene.ports]
+    cols = np.where(with_one, covariance.border_cols[:, border.DISTANCE], HELD)
     free = np.nonzero(cols != HELD)[0]
     if not len(free):
         return []
@@ -199,7 +199,7 @@ def _distances(
     grow = reported / np.sqrt(np.diag(block))
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
     ports = [result.scene.ports[c] for c in free]
-    sizes = [p.distance for p in ports if isinstance(p, FlatPort)]
+    sizes = [p.distance for p in ports if isinstance(p, PlanePort)]
     typical = float(np.mean(sizes))
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
@@ -255,7 +255,7 @@ def _tilts(
 ) -> list[str]:
     sentences = []
     for c, camera in enumerate(result.covariance.judged_cameras):
-        if not isinstance(result.scene.ports[c], FlatPort):
+        if not result.scene.ports[c].has("normal"):
             continue
         refined = bool(result.covariance.border_cols[c, border.NORMAL][0] != HELD)
         word = normal_verdict(camera, refined)
@@ -325,13 +325,12 @@ def _labels(
         border.LENGTH: "the baseline of {}",
         border.FIRST_LENS: "the focal length of {}",
     }
+    ports = result.scene.ports
     columns: list[int] = []
     labels: list[tuple[str, str]] = []
     for c, name in enumerate(names):
         for slot, text in kinds.items():
-            if slot == border.DISTANCE and not isinstance(
-                result.scene.ports[c], FlatPort
-            ):
+            if slot == border.DISTANCE and not ports[c].has("distance"):
                 continue
             column = int(result.covariance.border_cols[c, slot])
             if column != HELD and column not in columns:

@@ -6,7 +6,8 @@ import numpy as np
 
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DOME, FLAT, KIND
+from uwsfm.models.lens_row import FOCAL
+from uwsfm.models.ports.port import rows_with
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout
@@ -35,16 +36,16 @@ def border_priors(
     reference = State.from_scene(scene)
     stddevs = np.full(columns.shape, np.inf)
     stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
-    flat, dome = (reference.ports[:, KIND] == kind for kind in (FLAT, DOME))
-    stddevs[flat, border.DISTANCE] = settings.distance_stddev_m or np.inf
+    plane, dome = (rows_with(reference.ports, n) for n in ("normal", "center"))
+    stddevs[plane, border.DISTANCE] = settings.distance_stddev_m or np.inf
     # The prior is on the angle's two components; its RMS angle is sqrt(2) of one.
     tilt = np.radians(settings.normal_stddev_deg or np.inf) / np.sqrt(2.0)
-    stddevs[flat, border.NORMAL] = tilt
+    stddevs[plane, border.NORMAL] = tilt
     stddevs[dome, border.CENTER] = settings.center_stddev_m or np.inf
     _, waters = np.unique(columns[:, border.WATER_INDEX], return_index=True)
     stddevs[waters, border.WATER_INDEX] = settings.water_index_stddev or np.inf
     relative = settings.focal_stddev or np.inf
-    stddevs[:, [_FX, _FY]] = relative * reference.lenses[:, :2]
+    stddevs[:, [_FX, _FY]] = relative * reference.lenses[:, FOCAL]
     stddevs[:, [_CX, _CY]] = settings.principal_point_stddev_px or np.inf
     stddevs[:, _DISTORTION] = settings.distortion_stddev or np.inf
     shared = columns[:, _FX] == columns[:, _FY]

@@ -11,7 +11,7 @@ from uwsfm.calibration.choices import DEFAULT_ERRORS, PRIORS, ErrorName, Strateg
 from uwsfm.calibration.given_accuracy import GivenAccuracy
 from uwsfm.errors import InputError
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
@@ -186,8 +186,8 @@ class CalibrateOptions:
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
         count, ports = len(at_zero), [camera.port for camera in cameras]
-        flat = np.array([isinstance(port, FlatPort) for port in ports])
-        dome = np.array([isinstance(port, DomePort) for port in ports])
+        plane = np.array([port.has("normal") for port in ports])
+        dome = np.array([port.has("center") for port in ports])
         normals = _per_camera("refine_normals", self.refine_normals, count)
         distances = _per_camera("refine_distances", self.refine_distances, count)
         centers = _per_camera("refine_centers", self.refine_centers, count)
@@ -195,8 +195,8 @@ class CalibrateOptions:
         free[1:, border.ROTATION] = self.refine_cam_from_rig
         free[1:, border.DIRECTION] = self.refine_cam_from_rig
         free[1:, border.LENGTH] = self.baseline_stddev_m > 0.0
-        free[:, border.NORMAL] = (normals & flat)[:, None]
-        free[:, border.DISTANCE] = distances & flat & ~at_zero
+        free[:, border.NORMAL] = (normals & plane)[:, None]
+        free[:, border.DISTANCE] = distances & plane & ~at_zero
         free[dome, border.CENTER] = centers[dome, None]
         wanted = np.zeros((count, NUM_PARAMS), dtype=bool)
         for part, slots in LENS_PARTS.items():
@@ -226,7 +226,7 @@ class CalibrateOptions:
         first: dict[float, int] = {}
         return [
             None
-            if isinstance(port, NoPort)
+            if not port.refracts
             else c
             if self.separate_water_index
             else first.setdefault(port.n_water, c)

@@ -13,7 +13,7 @@ from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD
@@ -194,7 +194,7 @@ def _readings(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
     ports = [result.scene.ports[camera] for result in both]
-    flat = [port for port in ports if isinstance(port, FlatPort)]
+    flat = [port for port in ports if isinstance(port, PlanePort)]
     domes = [port for port in ports if isinstance(port, DomePort)]
     if len(flat) == 2:
         normals = np.array([port.normal for port in flat])
@@ -258,9 +258,10 @@ def _placement(
 def _lens(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
-    lenses = [result.scene.cameras[camera].camera for result in both]
-    for index, slot in enumerate(param_slots(lenses[0].model_name)):
-        values = np.array([[float(lens.params[index])] for lens in lenses])
+    first, second = (result.scene.cameras[camera].camera for result in both)
+    for index, slot in enumerate(param_slots(first.model_name)):
+        pair = first.params[index], second.params[index]
+        values = np.array([[float(value)] for value in pair])
         unit = "px" if slot < 4 else ""
         place = border.FIRST_LENS + slot
         yield _single("lens", LENS_NAMES[slot], unit, values, place)
