@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pycolmap
 
-from uwsfm import DomePort, FlatPort, NoPort
+from uwsfm import DomePort, FlatPort, InterfacePort, NoPort
 from uwsfm.geometry import unit_vector
 from uwsfm.models.ports.port import Port
 
@@ -73,7 +73,17 @@ DOMES = {
     "vacuum's water": DomePort((0.004, 0.0, 0.02), 0.07, 0.0, 1.5, 1.36),
     "filled with oil": DomePort((0.006, -0.004, 0.02), 0.06, 0.01, 1.6, 1.39, 1.3),
 }
-EXAMPLE_PORTS: dict[str, Port] = {**FLAT_PORTS, **DOMES, "none": NoPort()}
+INTERFACES = {
+    "above the surface": InterfacePort(tilted(6, 30), 0.4, 1.333),
+    "film": InterfacePort(tilted(15, -110), 1e-3, 1.34),
+    "from oil into air": InterfacePort(tilted(4, 60), 0.05, 1.0, 1.4),
+}
+EXAMPLE_PORTS: dict[str, Port] = {
+    **FLAT_PORTS,
+    **DOMES,
+    **INTERFACES,
+    "none": NoPort(),
+}
 """Every kind of port, and every index other than one somewhere: a factor of n_air is
 one in every housing that is filled with air."""
 
@@ -94,14 +104,14 @@ def port_blocks(port: Port) -> list[tuple[slice | list[int], Callable, float]]:
     thickness, n_glass, n_water; radius. Lengths of a flat port may pass through zero:
     its model is smooth there.
     """
-    glass: list[tuple[slice | list[int], Callable, float]] = [
-        ([4], _add([6]), 1e-4),
-        ([5], _add([7]), 1e-4),
-    ]
+    water: tuple[slice | list[int], Callable, float] = ([5], _add([7]), 1e-4)
+    glass = [([4], _add([6]), 1e-4), water]
     if isinstance(port, DomePort):
         centre = [(slice(0, 3), _add([0, 1, 2]), 1e-4)]
         return [*centre, ([3], _add([4]), 1e-4), *glass, ([6], _add([3]), 1e-4)]
     window = [(slice(0, 2), _tilt, 1e-4), ([2], _add([3]), 1e-5)]
+    if not port.has("thickness") and port.refracts:
+        return [*window, water]
     return [*window, ([3], _add([4]), 1e-5), *glass]
 
 

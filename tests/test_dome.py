@@ -171,5 +171,5 @@ def test_rows_return_their_ports():
     for port in (*DOMES.values(), NoPort()):
         assert port_from_row(port.row) == port
     assert DomePort.from_params(DomePort().params) == DomePort()
-    with pytest.raises(InputError, match="caustic is known of flat ports"):
+    with pytest.raises(InputError, match="caustic is known of planes only"):
         RefractiveCamera(PINHOLE, DomePort()).caustic([[0.0, 0.0]])

@@ -12,7 +12,8 @@ from uwsfm import CalibrateOptions, NoPort
 from uwsfm.calibration.priors import border_priors
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DOME, FLAT, KIND, NONE
+from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.row import KIND, N_WATER
 from uwsfm.residuals import point_3d, virtual_camera
 from uwsfm.simulate import (
     ObservationOptions,
@@ -66,12 +67,12 @@ def contradicted(scene):
     )
     cam_from_rig[1, 4:] *= 1.01
     for row in ports:
-        if row[KIND] == FLAT:
+        if row[KIND] == FlatPort.code:
             row[:3] = unit_vector.plus(row[:3], [0.02, -0.03])
             row[3] += 0.002
-        elif row[KIND] == DOME:
+        elif row[KIND] == DomePort.code:
             row[:3] += [0.002, -0.001, 0.003]
-    ports[ports[:, KIND] != NONE, 7] += 0.002
+    ports[ports[:, KIND] != NoPort.code, N_WATER] += 0.002
     for camera, row in zip(scene.cameras, lenses, strict=True):
         slots = list(param_slots(camera.camera.model_name))
         row[slots] += np.array(SHIFT)[slots]

@@ -52,7 +52,7 @@ def slots_of(parameter):
 
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=ids)
 def test_an_entry_has_all_facts(parameter):
-    assert parameter.name and parameter.plural and parameter.ports
+    assert parameter.name and parameter.plural
     accuracy = parameter.accuracy
     assert accuracy is not None and accuracy.because.endswith(".")
     if accuracy.key != "distortion":  # whose default depends on the lens

@@ -223,7 +223,11 @@ MISTAKES = [
     (PORT + "normal", [0, 0, 2], "port.normal: must have length 1, has length 2"),
     (PORT + "normal", [0, 1], "port.normal: needs 3 values, got 2"),
     (PORT + "glass_index", 0.67, "0.67 is not a refractive index"),
-    (PORT + "type", "cube", "port.type: must be 'flat', 'dome' or 'none', not 'cube'"),
+    (
+        PORT + "type",
+        "cube",
+        "port.type: must be 'flat', 'dome', 'none' or 'interface', not 'cube'",
+    ),
     (PORT + "refine", ["tilt"], "refine[0]: must be 'normal' or 'distance', not 'ti"),
     ("baseline_stddev_m", -0.1, "baseline_stddev_m: must be at least 0, not -0.1"),
     ("baseline_stddev_m", 0.3, "0.3 m should lie between 0 and the baseline, 0.2 m"),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from uwsfm.jobs.reconstruct import reconstruct
     from uwsfm.jobs.refine_model import refine_model
     from uwsfm.measuring.measure import measure
-    from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
+    from uwsfm.models.ports.port import DomePort, FlatPort, InterfacePort, NoPort
     from uwsfm.models.refractive import RefractiveCamera
     from uwsfm.models.status import Status
     from uwsfm.options.jobs import (
@@ -76,6 +76,7 @@ _HOMES = {
     "Lengths": "uwsfm.calibration.lengths",
     "Positions": "uwsfm.calibration.lengths",
     "FlatPort": "uwsfm.models.ports.port",
+    "InterfacePort": "uwsfm.models.ports.port",
     "NoPort": "uwsfm.models.ports.port",
     "Model": "uwsfm.colmap.model",
     "Rig": "uwsfm.rig.rig",
@@ -134,6 +135,7 @@ __all__ = [
     "DomePort",
     "FlatPort",
     "InputError",
+    "InterfacePort",
     "Lengths",
     "MatchOptions",
     "Model",

@@ -175,6 +175,15 @@ def straight(function: Function) -> Function:
     return _compiled(function, _Dispatcher, straight=True, fastmath=_LANE_MATH)
 
 
+def inner_unsaved(function: Function) -> Function:
+    """Compile a kernel that only kernels call, and that is made by another function.
+
+    It is kept inside its callers, not by itself: numba would keep what one line of
+    source makes for other kernels under names of one process.
+    """
+    return _compiled(function, _InnerDispatcher, saved=False)
+
+
 def inner_fused(function: Function) -> Function:
     """Compile a kernel that only kernels call, and whose sums may be regrouped."""
     return _compiled(function, _InnerDispatcher, fastmath=_LANE_MATH)
@@ -200,6 +209,7 @@ def _compiled(
     dispatcher: type[_Dispatcher],
     *,
     straight: bool = False,
+    saved: bool = True,
     **options: Any,
 ) -> Any:
     is_inner = issubclass(dispatcher, _InnerDispatcher)
@@ -208,6 +218,6 @@ def _compiled(
     made: Any = numba.njit(**_OPTIONS, **options)(function)
     if isinstance(made, CPUDispatcher):  # not where compilation is turned off
         made.__class__ = dispatcher
-        if CACHE_DIR is not None:
+        if saved and CACHE_DIR is not None:
             made.enable_caching()
     return made

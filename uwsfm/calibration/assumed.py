@@ -10,7 +10,6 @@ from uwsfm.calibration.given_accuracy import (
     given_accuracy,
 )
 from uwsfm.calibration.parameters import LENS_NAMES
-from uwsfm.calibration.problem import port_kind
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
 from uwsfm.models.refractive import RefractiveCamera
@@ -42,7 +41,7 @@ def camera_as_given(
         param_names=_param_names(slots),
         slots=slots,
         size_px=(camera.width, camera.height),
-        port=port_kind(port),
+        port=type(port),
         port_row=port.row,
         translation=translation,
         accuracy=accuracy or CameraAccuracy(),

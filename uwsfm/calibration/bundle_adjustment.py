@@ -22,7 +22,6 @@ from uwsfm.calibration.uncertainty import posterior_covariance
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
-from uwsfm.models.ports.port import FlatPort, NoPort
 from uwsfm.scene import Scene
 from uwsfm.solver.levenberg_marquardt import Report, Stop
 
@@ -130,12 +129,12 @@ def _check(scene: Scene, settings: CalibrateOptions, lengths: Lengths | None) ->
             f"error 'point_3d' tells nothing from {frames} frame: its points can be "
             "where the rays meet, whatever the ports; add frames or use another error"
         )
-    bare = all(isinstance(port, NoPort) for port in scene.ports)
+    bare = all(not port.refracts for port in scene.ports)
     for each in OF_PORTS:
         wanted = np.any(settings.refines(each, len(scene.cameras)))
         if bare and wanted and each.refine is not None and each.refine.flag:
             raise InputError(f"{each.refine.field}: no camera is behind a port")
-    other = [c for c, p in enumerate(scene.ports) if not isinstance(p, FlatPort)]
+    other = [c for c, p in enumerate(scene.ports) if not p.has("normal")]
     if other and settings.error_name != "reprojection":
         raise InputError(
             f"error {settings.error_name!r} is defined for flat ports, camera "

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from uwsfm.calibration.parameters import PARAMETERS
-from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import (
     CalibrationResult,
     CameraCovariance,
@@ -63,7 +62,7 @@ def column_factors(
     grow = np.ones(len(covariance.border))
     for columns, port in zip(covariance.border_cols, ports, strict=True):
         for parameter in PARAMETERS:
-            if port_kind(port) in parameter.ports:
+            if parameter.of(port):
                 some = np.atleast_1d(columns[parameter.slots])
                 grow[some[some != HELD]] = factors.get(parameter.group, 1.0)
     return grow

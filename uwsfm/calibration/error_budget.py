@@ -19,7 +19,7 @@ from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import PlanePort, Port
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 
@@ -179,7 +179,7 @@ class _Sheet:
             covariance = self.reach.added(steps, priors=True)
             spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
             shift = _shift(port, spread)
-            if isinstance(port, FlatPort):
+            if isinstance(port, PlanePort):
                 basis = unit_vector.tangent_basis(port.normal)
                 turn = covariance[border.NORMAL, border.NORMAL]
                 turned = np.sqrt(np.diag(basis @ turn @ basis.T))
@@ -199,10 +199,10 @@ class _Sheet:
 
 def _shift(port: Port, row: Array) -> Shift:
     normal, center, distance = np.zeros(3), np.zeros(3), 0.0
-    if isinstance(port, FlatPort):
+    if isinstance(port, PlanePort):
         normal = unit_vector.tangent_basis(port.normal) @ row[border.NORMAL]
         distance = float(row[border.DISTANCE])
-    elif isinstance(port, DomePort):
+    if port.has("center"):
         center = row[border.CENTER]
     return Shift(
         distance_m=distance,

@@ -32,6 +32,8 @@ from uwsfm.calibration.parameters import (
 )
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import CX, CY, FX
+from uwsfm.models.ports.kind import Port
 from uwsfm.residuals import border
 
 CORNER = 0.005
@@ -140,7 +142,7 @@ class GivenCamera:
     slots: tuple[int, ...]
     """Where each parameter of the lens model is in ``lens``."""
     size_px: tuple[int, int]
-    port: Literal["flat", "dome", "none"]
+    port: type[Port]
     port_row: Array
     translation: Array
     """(3,) of cam_from_rig; zeros if only its length is known."""
@@ -238,7 +240,7 @@ class _Row:
 
     def port(self) -> None:
         for parameter in (TILT, CENTER, *OF_PORTS):
-            if self.camera.port in parameter.ports:
+            if parameter.of(self.camera.port):
                 column = parameter.column
                 row = self.camera.port_row
                 self.parameter(parameter, 0.0 if column is None else float(row[column]))
@@ -286,7 +288,7 @@ def corner_shift(camera: GivenCamera, slot: int) -> float:
     if _radial(camera) is _SHAPE:
         return _shape_shift(camera.lens, camera.size_px, slot)
     powers = {slot: power for chain in _radial(camera) for slot, power in chain.items()}
-    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[0])
+    corner = float(np.hypot(*camera.size_px)) / 2.0 / float(camera.lens[FX])
     return corner ** powers.get(slot, 2)
 
 
@@ -295,9 +297,9 @@ def _shape_shift(lens: Array, size_px: tuple[int, int], slot: int) -> float:
     from uwsfm.models.lens import NUM_PARAMS, dir_from_img, jac_by_params
 
     corner = float(np.hypot(*size_px)) / 2.0
-    x, _, z = dir_from_img(lens[2] + corner, lens[3], lens)
+    x, _, z = dir_from_img(lens[CX] + corner, lens[CY], lens)
     if not z > 0.0:  # as far as it sees
-        x, _, z = dir_from_img(lens[2] + 0.5 * min(size_px), lens[3], lens)
+        x, _, z = dir_from_img(lens[CX] + 0.5 * min(size_px), lens[CY], lens)
     jac = np.empty((2, NUM_PARAMS))
     jac_by_params(x / z, 0.0, lens, jac)
     return float(abs(jac[0, slot])) / corner
@@ -330,7 +332,7 @@ def _couple_water(
     for j, second in enumerate(cameras):
         for i, first in enumerate(cameras[:j]):
             if (
-                second.port != "none"
+                second.port.refracts
                 and first.port_row[column] == second.port_row[column]
             ):
                 a, b = (k * border.BORDER_SIZE + slot for k in (i, j))

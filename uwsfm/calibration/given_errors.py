@@ -22,7 +22,6 @@ from uwsfm.calibration.uncertainty import (
     likelihood,
 )
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD, Layout, with_columns
@@ -221,7 +220,7 @@ def in_all(calibration: CalibrationResult, reach: GivenReach) -> InAll:
     for c, (own, pose) in enumerate(
         zip(covariance.cameras, calibration.scene.cam_from_rig, strict=True)
     ):
-        dome = isinstance(calibration.scene.ports[c], DomePort)
+        dome = calibration.scene.ports[c].has("center")
         more = camera_variances(added, every[c], pose, dome)
         total = _variances(own) + np.clip(more, 0.0, None)
         cameras.append(camera_covariance(total, own.distance_at_zero))

@@ -20,10 +20,9 @@ from uwsfm.calibration.parameters import (
     ROTATION,
     TILT,
 )
-from uwsfm.calibration.problem import port_kind
 from uwsfm.geometry import unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import FlatPort, Port
+from uwsfm.models.ports.port import PlanePort, Port
 from uwsfm.residuals import border
 
 
@@ -74,18 +73,18 @@ _Number = tuple[str, dict[int, float], str]
 def _numbers(
     reach: GivenReach, c: int, port: Port, stddevs: dict[int, float]
 ) -> Iterator[_Number]:
-    state, kind = reach.optimum.state, port_kind(port)
+    state = reach.optimum.state
     pose = state.cam_from_rig[c]
     yield from _by_axis(ROTATION, stddevs)
     if DIRECTION.first in stddevs:
         yield from _along_axes(pose[4:], DIRECTION, stddevs)
-    if isinstance(port, FlatPort) and TILT.first in stddevs:
+    if isinstance(port, PlanePort) and TILT.first in stddevs:
         yield from _along_axes(port.normal, TILT, stddevs)
-    if kind in CENTER.ports:
+    if CENTER.of(port):
         yield from _by_axis(CENTER, stddevs)
     for parameter in (*OF_PORTS, BASELINE):
         slot = parameter.first
-        if slot in stddevs and kind in parameter.ports:
+        if slot in stddevs and parameter.of(port):
             amount = _amount(parameter, stddevs[slot])
             yield parameter.name, {slot: stddevs[slot]}, amount
     yield from _lens_numbers(state.lenses[c], stddevs)

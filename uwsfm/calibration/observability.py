@@ -15,12 +15,11 @@ from uwsfm.calibration.error_budget import BudgetRow, Shift
 from uwsfm.calibration.length_verdicts import length_verdicts, small_length
 from uwsfm.calibration.parameters import BASELINE, FOCAL, OF_PORTS, WATER_INDEX
 from uwsfm.calibration.prior_verdicts import held_by_priors
-from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.residuals import border
 from uwsfm.scene import Scene
 from uwsfm.solver.layout import HELD
@@ -189,8 +188,8 @@ def _distances(
 ) -> list[str]:
     """The weak directions of the port distances, weakest first."""
     covariance = result.covariance
-    flat = [isinstance(port, FlatPort) for port in result.scene.ports]
-    cols = np.where(flat, covariance.border_cols[:, border.DISTANCE], HELD)
+    with_one = [port.has("distance") for port in result.scene.ports]
+    cols = np.where(with_one, covariance.border_cols[:, border.DISTANCE], HELD)
     free = np.nonzero(cols != HELD)[0]
     if not len(free):
         return []
@@ -203,7 +202,7 @@ def _distances(
     grow = reported / np.sqrt(np.diag(block))
     values, vectors = np.linalg.eigh(block * np.outer(grow, grow))
     ports = [result.scene.ports[c] for c in free]
-    sizes = [p.distance for p in ports if isinstance(p, FlatPort)]
+    sizes = [p.distance for p in ports if isinstance(p, PlanePort)]
     typical = float(np.mean(sizes))
     sentences = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
@@ -259,7 +258,7 @@ def _tilts(
 ) -> list[str]:
     sentences = []
     for c, camera in enumerate(result.covariance.judged_cameras):
-        if not isinstance(result.scene.ports[c], FlatPort):
+        if not result.scene.ports[c].has("normal"):
             continue
         refined = bool(result.covariance.border_cols[c, border.NORMAL][0] != HELD)
         word = normal_verdict(camera, refined)
@@ -327,7 +326,7 @@ def _labels(
     labels: list[tuple[str, str]] = []
     for c, (name, port) in enumerate(zip(names, result.scene.ports, strict=True)):
         for each in (*OF_PORTS, BASELINE, FOCAL):
-            if port_kind(port) not in each.ports:
+            if not each.of(port):
                 continue
             column = int(result.covariance.border_cols[c, each.first])
             if column != HELD and column not in columns:

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING
 
-PortKind = Literal["flat", "dome", "none"]
-GLASS: tuple[PortKind, ...] = ("flat", "dome")
-ANY: tuple[PortKind, ...] = ("flat", "dome", "none")
+if TYPE_CHECKING:
+    from uwsfm.models.ports.port import Port
+
+N_WATER = "n_water"
+"""The number that every port has which refracts."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +94,9 @@ class Parameter:
     """In the rows of `uwsfm.residuals.border`."""
     unit: Unit
     accuracy: Accuracy | None = None
-    ports: tuple[PortKind, ...] = ANY
-    """Cameras behind such ports have it."""
+    number: str | None = None
+    """Of ports, as `uwsfm.models.ports.kind.FILE_KEYS` and `N_WATER` have them: cameras
+    behind ports that have it. None: all cameras."""
     column: int | None = None
     """Of a single number: where it is in the row of a port."""
     step: str = ""
@@ -119,6 +122,12 @@ class Parameter:
         if isinstance(self.slots, slice):
             return int(self.slots.stop - self.slots.start)
         return 1
+
+    def of(self, port: "Port | type[Port]") -> bool:
+        """Whether a camera behind such a port has it."""
+        if self.number is None:
+            return True
+        return port.refracts if self.number == N_WATER else port.has(self.number)
 
     def listed_name(self, camera: str, part: str = "") -> str:
         """What a list calls it, with its unit if that is not plain.

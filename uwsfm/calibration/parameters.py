@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from uwsfm.calibration.parameter import (
     DEGREE,
-    GLASS,
     MILLIMETRE,
+    N_WATER,
     NUMBER,
     PIXEL,
     Accuracy,
@@ -19,6 +19,7 @@ from uwsfm.calibration.parameter import (
     Prior,
     Refine,
 )
+from uwsfm.models.ports import row
 from uwsfm.residuals import border
 
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -64,7 +65,7 @@ TILT = Parameter(
     plural="port tilts",
     slots=border.NORMAL,
     unit=DEGREE,
-    ports=("flat",),
+    number="normal",
     step="port tilt towards {}",
     part="tilt {}",
     refine=Refine(field="refine_normals", default=True, help="Normals of flat ports."),
@@ -85,7 +86,7 @@ CENTER = Parameter(
     plural="dome centres",
     slots=border.CENTER,
     unit=MILLIMETRE,
-    ports=("dome",),
+    number="center",
     step="dome centre {}",
     part="centre {}",
     refine=Refine(
@@ -110,8 +111,8 @@ DISTANCE = Parameter(
     plural="port distances",
     slots=border.DISTANCE,
     unit=MILLIMETRE,
-    ports=("flat",),
-    column=3,
+    number="distance",
+    column=row.DISTANCE,
     refine=Refine(
         field="refine_distances", default=True, help="Distances of flat ports."
     ),
@@ -137,8 +138,8 @@ RADIUS = Parameter(
     plural="dome radii",
     slots=border.RADIUS,
     unit=MILLIMETRE,
-    ports=("dome",),
-    column=3,
+    number="radius",
+    column=row.RADIUS,
     bounds=(0.0, math.inf),
     listed=True,
     accuracy=Accuracy(
@@ -155,8 +156,8 @@ THICKNESS = Parameter(
     plural="glass thicknesses",
     slots=border.THICKNESS,
     unit=MILLIMETRE,
-    ports=GLASS,
-    column=4,
+    number="thickness",
+    column=row.THICKNESS,
     bounds=(0.0, math.inf),
     listed=True,
     refine=Refine(
@@ -184,8 +185,8 @@ GLASS_INDEX = Parameter(
     plural="glass indices",
     slots=border.GLASS_INDEX,
     unit=NUMBER,
-    ports=GLASS,
-    column=6,
+    number="n_glass",
+    column=row.N_GLASS,
     bounds=(1.0, 4.0),
     listed=True,
     refine=Refine(
@@ -212,8 +213,8 @@ WATER_INDEX = Parameter(
     plural="water indices",
     slots=border.WATER_INDEX,
     unit=NUMBER,
-    ports=GLASS,
-    column=7,
+    number=N_WATER,
+    column=row.N_WATER,
     bounds=(1.0, 4.0),
     listed=True,
     refine=Refine(

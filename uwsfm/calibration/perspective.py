@@ -13,6 +13,7 @@ import numpy as np
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.result import CalibrateSummary
 from uwsfm.geometry.rays import finite_rows
+from uwsfm.models.lens_row import CENTER, CX, CY, FX, FY
 from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import Scene
@@ -44,8 +45,8 @@ def perspective_adjustment(
         rows = scene.camera_idx == index
         pinholes.append(_pinhole(camera))
         _, dirs = RefractiveCamera(camera.camera, NoPort()).ray_from_img(scene.xy[rows])
-        focal = np.sqrt(camera.lens[0] * camera.lens[1])
-        xy[rows] = focal * dirs[:, :2] / dirs[:, 2:] + camera.lens[2:4]
+        focal = np.sqrt(camera.lens[FX] * camera.lens[FY])
+        xy[rows] = focal * dirs[:, :2] / dirs[:, 2:] + camera.lens[CENTER]
     seen = finite_rows(xy)
     flat, used = replace(scene, cameras=tuple(pinholes), xy=xy).select(seen)
     result = calibrate(
@@ -70,12 +71,12 @@ def perspective_adjustment(
 def _pinhole(camera: RefractiveCamera) -> RefractiveCamera:
     """Eq. f_water = 1.333 f_air, without distortion yet."""
     lens, port = camera.lens, camera.port
-    focal = port.n_water / port.n_air * np.sqrt(lens[0] * lens[1])
+    focal = port.n_water / port.n_air * np.sqrt(lens[FX] * lens[FY])
     make: Any = type(camera.camera)
     pinhole = make(
         model="RADIAL",
         width=camera.width,
         height=camera.height,
-        params=[focal, lens[2], lens[3], 0.0, 0.0],
+        params=[focal, lens[CX], lens[CY], 0.0, 0.0],
     )
     return RefractiveCamera(pinhole, NoPort())

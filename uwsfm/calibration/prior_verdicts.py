@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from uwsfm.calibration.parameter import Parameter
 from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.priors import prior_stddevs
-from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.solver.layout import HELD
 
@@ -55,7 +54,7 @@ def held_by_priors(result: CalibrationResult, names: Sequence[str]) -> list[str]
     for c, name in enumerate(names):
         for each in OF_PORTS:
             refined = result.covariance.border_cols[c, each.first] != HELD
-            has = port_kind(result.scene.ports[c]) in each.ports
+            has = each.of(result.scene.ports[c])
             if not (refined and has and each.prior is not None):
                 continue
             if prior_verdict(result, each, c) == "held by the prior":

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from uwsfm.calibration.assumed import assumed_accuracy
 from uwsfm.calibration.parameter import Parameter
 from uwsfm.calibration.parameters import PARAMETERS
-from uwsfm.calibration.problem import CalibrateOptions, exact_error, port_kind
+from uwsfm.calibration.problem import CalibrateOptions, exact_error
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.residuals import border
@@ -60,14 +60,14 @@ def prior_stddevs(
     """
     stddevs = np.full(columns.shape, np.inf)
     stddevs[:, border.LENGTH] = settings.baseline_stddev_m or np.inf
-    kinds = np.array([port_kind(port) for port in scene.ports])
     lenses = np.array([camera.lens for camera in scene.cameras])
     for parameter in PARAMETERS:
         if parameter.prior is None or parameter.accuracy is None:
             continue
-        has, known = np.isin(kinds, parameter.ports), settings.prior(parameter)
+        has = np.array([parameter.of(port) for port in scene.ports])
+        known = settings.prior(parameter)
         if known is not None:
-            per = parameter.accuracy.per * np.ones((len(kinds), parameter.size))
+            per = parameter.accuracy.per * np.ones((len(has), parameter.size))
             if parameter.accuracy.relative:
                 first = parameter.first - border.FIRST_LENS
                 per = lenses[:, first : first + parameter.size]
@@ -78,7 +78,7 @@ def prior_stddevs(
             if refined.any():
                 _take_accuracy(scene, settings, parameter, refined, stddevs)
     _, waters = np.unique(columns[:, border.WATER_INDEX], return_index=True)
-    one = np.zeros(len(kinds), dtype=bool)
+    one = np.zeros(len(columns), dtype=bool)
     one[waters] = True
     stddevs[~one, border.WATER_INDEX] = np.inf  # one water, known once
     shared = columns[:, _FX] == columns[:, _FY]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.choices import DEFAULT_ERRORS, ErrorName, Strategy
 from uwsfm.calibration.given_accuracy import GivenAccuracy
-from uwsfm.calibration.parameter import Parameter, PortKind
+from uwsfm.calibration.parameter import Parameter
 from uwsfm.calibration.parameters import LENS, PARAMETERS, PRIORS
 from uwsfm.errors import InputError
 from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.ports.port import DomePort, NoPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
@@ -211,13 +211,12 @@ class CalibrateOptions(_OfParameters):
             at_zero: (C,) ports whose distance is held at zero, its bound.
         """
         count, ports = len(at_zero), [camera.port for camera in cameras]
-        kinds = np.array([port_kind(port) for port in ports])
         free = np.zeros((count, border.BORDER_SIZE), dtype=bool)
         free[1:, border.ROTATION] = self.refine_cam_from_rig
         free[1:, border.DIRECTION] = self.refine_cam_from_rig
         free[1:, border.LENGTH] = self.baseline_stddev_m > 0.0
         for parameter in PARAMETERS:
-            has = np.isin(kinds, parameter.ports)
+            has = np.array([parameter.of(port) for port in ports])
             free[has & self.refines(parameter, count), parameter.slots] = True
         free[at_zero, border.DISTANCE] = False
         models = [camera.camera.model_name for camera in cameras]
@@ -257,7 +256,7 @@ class CalibrateOptions(_OfParameters):
         first: dict[float, int] = {}
         return [
             None
-            if isinstance(port, NoPort)
+            if not port.refracts
             else c
             if self.separate_water_index
             else first.setdefault(port.n_water, c)
@@ -273,13 +272,6 @@ def exact_error(parameter: Parameter, where: str) -> str:
         f"{parameter.name} as exact; give --prior {parameter.prior.field}=..., or hold "
         "it"
     )
-
-
-def port_kind(port: Port) -> PortKind:
-    """What parameters a port has."""
-    if isinstance(port, NoPort):
-        return "none"
-    return "dome" if isinstance(port, DomePort) else "flat"
 
 
 def _one_of(name: str, value: str, allowed: Iterable[str]) -> None:

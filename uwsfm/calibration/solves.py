@@ -13,8 +13,8 @@ from uwsfm.calibration.result import SolveHistory
 from uwsfm.calibration.strategies import STRATEGIES
 from uwsfm.calibration.uncertainty import Optimum, held_length_stddev
 from uwsfm.errors import InputError, UwsfmError
-from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DOME, FLAT, KIND
+from uwsfm.models.ports.port import behind_camera, kind_of_row, rows_with
+from uwsfm.models.ports.row import DISTANCE
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout, build_layout
@@ -130,10 +130,10 @@ class Run:
         """
         self.at_zero[:] = False
         solved = self._solve_free(start, keep, loss, sigma_px)
-        while np.any(negative := _behind_camera(solved.state.ports)):
+        while np.any(negative := behind_camera(solved.state.ports)):
             self.at_zero |= negative
             ports = solved.state.ports.copy()
-            ports[self.at_zero, 3] = 0.0
+            ports[self.at_zero, DISTANCE] = 0.0
             solved = self._solve_free(
                 replace(solved.state, ports=ports), keep, loss, sigma_px
             )
@@ -245,9 +245,9 @@ class Run:
         for the glass, which does not, hardly shows."""
         ports, free = State.from_scene(self.scene).ports, self.columns != HELD
         settings = self.settings
-        flat = (ports[:, KIND] == FLAT) & (settings.distance_stddev_m is None)
-        dome = (ports[:, KIND] == DOME) & (settings.center_stddev_m is None)
-        moving = flat & free[:, border.DISTANCE] | dome & free[:, border.CENTER][:, 0]
+        plane = rows_with(ports, "distance") & (settings.distance_stddev_m is None)
+        dome = rows_with(ports, "center") & (settings.center_stddev_m is None)
+        moving = plane & free[:, border.DISTANCE] | dome & free[:, border.CENTER][:, 0]
         return bool(np.any(moving))
 
     def with_free_scale(
@@ -290,11 +290,6 @@ class Run:
         return stddev
 
 
-def _behind_camera(ports: Array) -> NDArray[np.bool_]:
-    """Mask (C,) of the flat ports whose distance is negative."""
-    return (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
-
-
 def _check_bounds(state: State, columns: IndexArray) -> None:
     """Refuse what was refined of the glass or the water and has left its bounds."""
     for each in OF_PORTS:
@@ -314,16 +309,6 @@ def _check_bounds(state: State, columns: IndexArray) -> None:
 
 def _check_ports(state: State) -> None:
     for camera, row in enumerate(state.ports):
-        offset = float(np.linalg.norm(row[:3]))
-        if row[KIND] == DOME and not offset < row[3]:
-            raise UwsfmError(
-                f"the dome of camera number {camera + 1} moved away, to a centre "
-                f"{offset:.3f} m from the camera at a radius of {row[3]:.3f} m: the "
-                "start is too far off, or the images do not determine the centre"
-            )
-        if row[KIND] == FLAT and not row[2] > 0.0:
-            raise UwsfmError(
-                f"the port normal of camera number {camera + 1} turned away from the "
-                f"water, to ({row[0]:.3f}, {row[1]:.3f}, {row[2]:.3f}): the start is "
-                "too far off or cam_from_rig is wrong"
-            )
+        wrong = kind_of_row(row).departed(row, f"camera number {camera + 1}")
+        if wrong:
+            raise UwsfmError(wrong)

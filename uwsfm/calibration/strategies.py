@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from uwsfm.errors import UwsfmError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.ports.row import DISTANCE
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.error_models import error_model
@@ -59,7 +60,7 @@ def minimize_nested(
         return loops.settle(state)
     found = root(
         passes.change,
-        np.maximum(state.ports[loops.free, 3], MIN_START),
+        np.maximum(state.ports[loops.free, DISTANCE], MIN_START),
         method="hybr",
         options={
             "xtol": TOLERANCE,
@@ -107,7 +108,7 @@ class NestedLoops:
         """
         settled = self.settle(state)
         if settled.num_invalid == len(settled.squares):
-            distances = ", ".join(f"{value:.3f}" for value in state.ports[:, 3])
+            distances = ", ".join(f"{value:.3f}" for value in state.ports[:, DISTANCE])
             raise UwsfmError(
                 f"no observation can be projected any more at port distances of "
                 f"{distances} m: start closer to the truth, or use strategy='joint'"
@@ -131,12 +132,12 @@ class _Passes:
         self.num_iterations += settled.num_iterations
         if self._report is not None:
             self._report(self.num_iterations, settled.cost)
-        return moved.ports[self._loops.free, 3] - distances
+        return moved.ports[self._loops.free, DISTANCE] - distances
 
     def state_at(self, distances: Array) -> State:
         """The latest state, with other distances."""
         ports = self.state.ports.copy()
-        ports[self._loops.free, 3] = distances
+        ports[self._loops.free, DISTANCE] = distances
         return replace(self.state, ports=ports)
 
 

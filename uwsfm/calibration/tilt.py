@@ -12,7 +12,7 @@ import numpy as np
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 from uwsfm.residuals import border
 from uwsfm.solver.layout import HELD
 
@@ -40,7 +40,7 @@ def paper_tilt(calibration: CalibrationResult, camera: int) -> PaperTilt:
         camera: index of a camera behind a flat port.
     """
     port = calibration.scene.ports[camera]
-    assert isinstance(port, FlatPort)
+    assert isinstance(port, PlanePort)
     x, y, z = port.normal
     sine = math.hypot(x, y)
     azimuth = math.atan2(y, x)
@@ -76,7 +76,7 @@ def slope_stddevs_deg(calibration: CalibrationResult, camera: int) -> _Stddevs:
         camera: index of a camera behind a flat port.
     """
     port = calibration.scene.ports[camera]
-    assert isinstance(port, FlatPort)
+    assert isinstance(port, PlanePort)
     level = np.sqrt(1.0 - np.square(port.normal[:2]))
     slopes = unit_vector.tangent_basis(port.normal)[:2] / level[:, None]
     return _stddevs(slopes, _normal_blocks(calibration, camera))

@@ -16,7 +16,7 @@ from uwsfm.calibration.scale import by_unknowns, scale_slope
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DOME, KIND, DomePort
+from uwsfm.models.ports.port import kind_of_row
 from uwsfm.residuals import border as border_of
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.clustered import cluster_scores, clustered_covariance
@@ -148,7 +148,7 @@ def _posterior_covariance(optimum: Optimum, reduction: Reduction) -> Posterior:
     cameras = []
     for camera, pose in enumerate(optimum.state.cam_from_rig):
         cols, at_zero = optimum.columns[camera], bool(optimum.at_zero[camera])
-        dome = bool(optimum.state.ports[camera, KIND] == DOME)
+        dome = kind_of_row(optimum.state.ports[camera]).has("center")
         alone, together = (
             camera_variances(b, cols, pose, dome) for b in (border, shared)
         )
@@ -223,7 +223,7 @@ def predict_covariance(
         points=variance * point_covariances(layout, eqs, reduced),
         cameras=tuple(
             camera_covariance(
-                camera_variances(border, cols, pose, isinstance(port, DomePort)), False
+                camera_variances(border, cols, pose, port.has("center")), False
             )
             for cols, pose, port in zip(
                 columns, scene.cam_from_rig, scene.ports, strict=True

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uwsfm.cli.console import STYLES
+from uwsfm.models.ports.port import kind_of_word
 from uwsfm.report.tables import lengths_note
 from uwsfm.report.words import tilts_of
 from uwsfm.results.verdict_summary import WITHHELD
@@ -42,9 +43,10 @@ def housing_table(summary: dict[str, Any]) -> Table:
 
 def _port_rows(camera: dict[str, Any], unit: str) -> list[tuple[str, ...]]:
     """What, estimate, standard deviations and verdict of what a port has."""
-    if camera["port"] == "none":
-        return [("none", "", "", "", "")]
-    if camera["port"] == "dome":
+    kind = kind_of_word(camera["port"])
+    if not kind.refracts:
+        return [(kind.word, "", "", "", "")]
+    if kind.has("center"):
         center = camera["center_m"]
         both = (camera["center_stddev_m"], camera["center_stddev_in_all_m"])
         return [
@@ -150,11 +152,12 @@ def _add_refined(table: Table, entries: Iterable[dict[str, Any]]) -> None:
         table.add_row(Text(entry["name"]), text)
 
 
-_SHIFTS: dict[str, tuple[str, ...]] = {
-    "flat": ("tilt (deg)", "distance ({})"),
-    "dome": ("centre x, y, z ({})",),
-    "none": (),
+_SHIFTS = {
+    "normal": "tilt (deg)",
+    "distance_m": "distance ({})",
+    "center_m": "centre x, y, z ({})",
 }
+"""Of the numbers of a port."""
 
 
 BUDGET_ROWS = 12
@@ -178,7 +181,7 @@ def budget_table(summary: dict[str, Any], num_rows: int = BUDGET_ROWS) -> Table:
     table.add_column("by", justify="right")
     for camera in summary["cameras"]:
         name = camera["name"]
-        for what in _SHIFTS[camera["port"]]:
+        for what in (text for key, text in _SHIFTS.items() if key in camera):
             text = what.format(summary["scale"]["small_unit"])
             table.add_column(f"{name}\n{text}", justify="right")
     table.add_column("lengths\n(%)", justify="right")
@@ -197,10 +200,10 @@ def _budget_cells(
 ) -> Iterable[str]:
     number = "{:" + sign + ".2f}"
     for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
-        if camera["port"] == "flat":
+        if "normal" in camera:
             yield _number(shift["tilt_deg"], "{:.3f}")
             yield _number(shift["distance_m"], number, 1e3)
-        elif camera["port"] == "dome":
+        if "center_m" in camera:
             yield _millimetres(shift["center_m"])
     yield _number(row["scale"], number, 1e2)
 

@@ -73,7 +73,7 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
     expected = np.array([true_poses[name] for name in model.frame_names])
     cameras, domes = [], []
     for entry, camera in zip(result.summary["cameras"], truth["cameras"], strict=True):
-        if entry["port"] == "dome":
+        if "center_m" in entry:
             domes.append(
                 DomeComparison(
                     name=entry["name"],
@@ -82,7 +82,7 @@ def compare_with_truth(result: ReconstructResult, truth_path: Path) -> Compariso
                     true_center_m=tuple(camera["center_m"]),
                 )
             )
-        if entry["port"] != "flat":
+        if "normal" not in entry:
             continue
         cameras.append(
             CameraComparison(

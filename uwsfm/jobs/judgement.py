@@ -9,7 +9,6 @@ from uwsfm.calibration.enlarged import enlarged
 from uwsfm.calibration.error_budget import ALIKE, BudgetRow, with_budget
 from uwsfm.calibration.observability import verdicts
 from uwsfm.calibration.result import CalibrationResult
-from uwsfm.models.ports.port import NoPort
 from uwsfm.results.halves_summary import KEY, halves_numbers
 from uwsfm.results.summary import budget_summary
 from uwsfm.results.verdict_summary import with_verdict
@@ -144,7 +143,7 @@ def housing_warnings(
         warnings += verdicts(calibration, names, budget)
     warnings += enlarged_notes(calibration.covariance.enlarged)
     warnings += _prior_note(budget)
-    bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
+    bare = [c.name for c in rig.cameras if not c.port.refracts]
     if bare:
         warnings.append(
             f"the rig file has no port of {', '.join(bare)}: lenses without one were "

@@ -30,7 +30,7 @@ from uwsfm.jobs.output_folder import (
     output_folder,
     require_elsewhere,
 )
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 from uwsfm.options.jobs import RefineOptions
 from uwsfm.report.command import command_line
 from uwsfm.results.files import HOUSING, SPARSE
@@ -63,8 +63,6 @@ CLEARLY_WORSE = 1.25
 """The refractive model has less freedom than a pinhole per image, and on raw images a
 smaller error all the same (0.3 of the pinhole's in a simulated dive; on undistorted
 images 1.65): an error so much larger is a contradiction."""
-MAX_DISTANCE_M = 0.5
-"""Of a port from its lens; what a rig file takes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,7 +240,7 @@ class _Job(ModelJob):
                 "its images were undistorted; give a model of the raw images"
             )
         for camera, port in zip(self.rig.cameras, refined.scene.ports, strict=True):
-            if isinstance(port, FlatPort) and port.distance > MAX_DISTANCE_M:
+            if isinstance(port, PlanePort) and port.distance > port.max_distance_m:
                 raise UwsfmError(
                     f"{found.folder}: the port of camera {camera.name!r} would be "
                     f"{port.distance:.2f} m away from the lens: are the images of the "

@@ -19,6 +19,25 @@ import numpy as np
 from uwsfm._base.jit import inner, lane
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import (
+    CX,
+    CY,
+    DISTORTION,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    K5,
+    K6,
+    KIND,
+    LENS_SIZE,
+    LIMIT,
+    NUM_PARAMS,
+    P1,
+    P2,
+)
 from uwsfm.models.lens_wide import (
     EUCM,
     FOV,
@@ -30,13 +49,9 @@ from uwsfm.models.lens_wide import (
     wide_limit,
 )
 
-LENS_SIZE = 14
-NUM_PARAMS = 12
 PINHOLE: Final = 0
 BROWN: Final = 1
 FISHEYE: Final = 2
-KIND, LIMIT = 12, 13
-"""Places in the row."""
 _ALL = tuple(range(NUM_PARAMS))
 
 # The kind of each COLMAP model, and where it keeps its parameters in the common row.
@@ -86,8 +101,8 @@ def lens_row(model: str, params: Sequence[float] | Array) -> Array:
     row = np.zeros(LENS_SIZE)
     row[list(slots)] = values
     if 1 not in slots:
-        row[1] = row[0]
-    if row[0] <= 0.0 or row[1] <= 0.0:
+        row[FY] = row[FX]
+    if row[FX] <= 0.0 or row[FY] <= 0.0:
         raise InputError(f"camera model {model}: the focal length must be positive")
     row[KIND] = kind
     row = with_limit(row)
@@ -109,7 +124,7 @@ def with_limit(row: Array) -> Array:
     elif row[KIND] in (FOV, EUCM):
         row[LIMIT] = wide_limit(row)
     else:
-        row[KIND] = BROWN if np.any(row[4:NUM_PARAMS] != 0.0) else PINHOLE
+        row[KIND] = BROWN if np.any(row[DISTORTION] != 0.0) else PINHOLE
         row[LIMIT] = _brown_limit(row)
     return row
 
@@ -127,8 +142,8 @@ def _smallest_positive_root(coefficients: Array) -> float:
 
 def _brown_limit(row: Array) -> float:
     """Smallest s = r^2 where d(r N(s) / D(s)) / dr = 0 or the denominator vanishes."""
-    num = np.array([1.0, row[4], row[5], row[8]])
-    den = np.array([1.0, row[9], row[10], row[11]])
+    num = np.array([1.0, row[K1], row[K2], row[K3]])
+    den = np.array([1.0, row[K4], row[K5], row[K6]])
     poly = np.polynomial.polynomial
     slope = poly.polymul(poly.polyder(num), den)
     slope = poly.polysub(slope, poly.polymul(num, poly.polyder(den)))
@@ -138,7 +153,7 @@ def _brown_limit(row: Array) -> float:
 
 def _fisheye_limit(row: Array) -> float:
     """Smallest angle where d(theta_d) / d(theta) = 0, at most 90 degrees."""
-    k1, k2, k3, k4 = row[4], row[5], row[8], row[9]
+    k1, k2, k3, k4 = row[K1], row[K2], row[K3], row[K4]
     square = _smallest_positive_root(np.array([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4]))
     return min(math.sqrt(square), 0.5 * math.pi)
 
@@ -146,11 +161,11 @@ def _fisheye_limit(row: Array) -> float:
 @inner
 def distort(u, v, lens):
     """Distorted (u, v), and d(distorted) / d(u, v) as 4 scalars; NaN out of range."""
-    if lens[12] == PINHOLE:
+    if lens[KIND] == PINHOLE:
         return u, v, 1.0, 0.0, 0.0, 1.0
-    if lens[12] == BROWN:
+    if lens[KIND] == BROWN:
         return _distort_brown(u, v, lens)
-    if lens[12] == FISHEYE:
+    if lens[KIND] == FISHEYE:
         return _distort_fisheye(u, v, lens)
     return distort_wide(u, v, lens)
 
@@ -159,14 +174,14 @@ def distort(u, v, lens):
 def coefficients(lens):
     """Distortion parameters of a row, as a tuple (k1, k2, p1, p2, k3, k4, k5, k6)."""
     return (
-        lens[4],
-        lens[5],
-        lens[6],
-        lens[7],
-        lens[8],
-        lens[9],
-        lens[10],
-        lens[11],
+        lens[K1],
+        lens[K2],
+        lens[P1],
+        lens[P2],
+        lens[K3],
+        lens[K4],
+        lens[K5],
+        lens[K6],
     )
 
 
@@ -196,7 +211,7 @@ def brown(u, v, params):
 def _distort_brown(u, v, lens):
     x, y, xu, xv, yv, det = brown(u, v, coefficients(lens))
     # Tangential terms fold it a little earlier than the limit of the radial ones.
-    if not (u * u + v * v < lens[13] and det > 0.0):
+    if not (u * u + v * v < lens[LIMIT] and det > 0.0):
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     return x, y, xu, xv, xv, yv
 
@@ -216,7 +231,7 @@ def _distort_fisheye(u, v, lens):
     s = u * u + v * v
     radius = math.sqrt(s)
     theta = math.atan(radius)
-    if not theta < lens[13]:
+    if not theta < lens[LIMIT]:
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     if radius < 1e-8:  # theta_d / r = 1 + O(r^2) to rounding
         return u, v, 1.0, 0.0, 0.0, 1.0
@@ -235,14 +250,14 @@ def jac_by_params(u, v, lens, jac):
         u, v: x / z and y / z of a direction within the range of the lens.
     """
     ud, vd, _, _, _, _ = distort(u, v, lens)
-    fx, fy = lens[0], lens[1]
+    fx, fy = lens[FX], lens[FY]
     jac[0, 0], jac[1, 0], jac[0, 1], jac[1, 1] = ud, 0.0, 0.0, vd
     jac[0, 2], jac[1, 2], jac[0, 3], jac[1, 3] = 1.0, 0.0, 0.0, 1.0
-    if lens[12] > FISHEYE:
+    if lens[KIND] > FISHEYE:
         wide_by_params(u, v, lens, jac)
         return
     s = u * u + v * v
-    if lens[12] == FISHEYE:
+    if lens[KIND] == FISHEYE:
         radius = math.sqrt(s)
         theta = math.atan(radius)
         power = 1.0 if radius < 1e-8 else theta / radius
@@ -253,8 +268,8 @@ def jac_by_params(u, v, lens, jac):
             power *= s
             jac[0, k], jac[1, k] = fx * u * power, fy * v * power
         return
-    den = 1.0 + s * (lens[9] + s * (lens[10] + s * lens[11]))
-    radial = (1.0 + s * (lens[4] + s * (lens[5] + s * lens[8]))) / den
+    den = 1.0 + s * (lens[K4] + s * (lens[K5] + s * lens[K6]))
+    radial = (1.0 + s * (lens[K1] + s * (lens[K2] + s * lens[K3]))) / den
     power = s / den
     for k, m in ((4, 9), (5, 10), (8, 11)):
         jac[0, k], jac[1, k] = fx * u * power, fy * v * power
@@ -278,10 +293,10 @@ def img_from_dir(x, y, z, lens):
     inv_z = 1.0 / z
     u, v = x * inv_z, y * inv_z
     ud, vd, a11, a12, a21, a22 = distort(u, v, lens)
-    fx, fy = lens[0] * inv_z, lens[1] * inv_z
+    fx, fy = lens[FX] * inv_z, lens[FY] * inv_z
     return (
-        lens[0] * ud + lens[2],
-        lens[1] * vd + lens[3],
+        lens[FX] * ud + lens[CX],
+        lens[FY] * vd + lens[CY],
         fx * a11,
         fx * a12,
         -fx * (a11 * u + a12 * v),
@@ -295,14 +310,14 @@ def img_from_dir(x, y, z, lens):
 def dir_from_img(px, py, lens):
     """Unit direction in the camera frame of a pixel; NaN where none exists."""
     nan = math.nan
-    xd = (px - lens[2]) / lens[0]
-    yd = (py - lens[3]) / lens[1]
-    if lens[12] == FISHEYE:
+    xd = (px - lens[CX]) / lens[FX]
+    yd = (py - lens[CY]) / lens[FY]
+    if lens[KIND] == FISHEYE:
         return _dir_from_fisheye(xd, yd, lens)
-    if lens[12] > FISHEYE:
+    if lens[KIND] > FISHEYE:
         return dir_from_wide(xd, yd, lens)
     u, v = xd, yd
-    if lens[12] == BROWN:
+    if lens[KIND] == BROWN:
         u, v = _undistort_brown(xd, yd, lens)
     norm = math.sqrt(1.0 + u * u + v * v)
     if not norm < math.inf:
@@ -315,8 +330,8 @@ def _undistort_brown(xd, yd, lens):
     """Newton on the distortion, halved where it would leave the invertible disc."""
     u, v = xd, yd
     s = u * u + v * v
-    if not s < 0.81 * lens[13]:  # near the limit the slope is too flat to start from
-        shrink = 0.9 * math.sqrt(lens[13] / s)
+    if not s < 0.81 * lens[LIMIT]:  # near the limit the slope is too flat to start from
+        shrink = 0.9 * math.sqrt(lens[LIMIT] / s)
         u, v = u * shrink, v * shrink
     for _ in range(60):
         x, y, a11, a12, a21, a22 = distort(u, v, lens)
@@ -324,7 +339,7 @@ def _undistort_brown(xd, yd, lens):
         det = a11 * a22 - a12 * a21
         du, dv = (a22 * ex - a12 * ey) / det, (a11 * ey - a21 * ex) / det
         step = 1.0
-        while not (u - step * du) ** 2 + (v - step * dv) ** 2 < lens[13]:
+        while not (u - step * du) ** 2 + (v - step * dv) ** 2 < lens[LIMIT]:
             step *= 0.5
             if step < 1e-3:
                 return math.nan, math.nan
@@ -341,10 +356,10 @@ def _dir_from_fisheye(xd, yd, lens):
     target = math.sqrt(xd * xd + yd * yd)
     if target < 1e-12:
         return xd, yd, 1.0
-    limit, _ = fisheye_angle(lens[13], coefficients(lens))
+    limit, _ = fisheye_angle(lens[LIMIT], coefficients(lens))
     if not target < limit:
         return nan, nan, nan
-    low, high = 0.0, lens[13]
+    low, high = 0.0, lens[LIMIT]
     theta = min(target, 0.5 * (low + high))
     for _ in range(100):  # monotonic up to the limit: Newton inside a bracket
         value, slope = fisheye_angle(theta, coefficients(lens))

@@ -24,6 +24,7 @@ from uwsfm.models.lens import (
     coefficients,
     fisheye_angle,
 )
+from uwsfm.models.lens_row import CX, CY, FX, FY, KIND, LIMIT
 
 # Newton is quadratic: a step of 1e-8 was the last but rounding.
 LAST_STEP2: Final = 1e-16
@@ -86,16 +87,16 @@ def _none(buffer):
 @inner
 def img_lanes(lens, buffer):
     """Pixels and d(pixel) / dv of the rays in air VX, VY, VZ."""
-    fx, fy, cx, cy, limit = lens[0], lens[1], lens[2], lens[3], lens[13]
+    fx, fy, cx, cy, limit = lens[FX], lens[FY], lens[CX], lens[CY], lens[LIMIT]
     params = coefficients(lens)
-    if lens[12] == PINHOLE:
+    if lens[KIND] == PINHOLE:
         for i in range(BLOCK):
             z = buffer[VZ * STRIDE + i]
             inv_z = 1.0 / z
             u, v = buffer[VX * STRIDE + i] * inv_z, buffer[VY * STRIDE + i] * inv_z
             plain = (u, v, 1.0, 0.0, 1.0)
             _store(fx, fy, cx, cy, i, u, v, inv_z, plain, z, buffer)
-    elif lens[12] == BROWN:
+    elif lens[KIND] == BROWN:
         for i in range(BLOCK):
             z = buffer[VZ * STRIDE + i]
             inv_z = 1.0 / z
@@ -103,7 +104,7 @@ def img_lanes(lens, buffer):
             x, y, xu, xv, yv, det = brown(u, v, params)
             ok = min(z, min(det, limit - (u * u + v * v)))
             _store(fx, fy, cx, cy, i, u, v, inv_z, (x, y, xu, xv, yv), ok, buffer)
-    elif lens[12] != FISHEYE:  # left to the scalar kernels
+    elif lens[KIND] != FISHEYE:  # left to the scalar kernels
         _none(buffer)
     else:
         for i in range(BLOCK):
@@ -148,13 +149,13 @@ def _fisheye_step(theta, target, params):
 @inner
 def dir_lanes(lens, buffer):
     """Unit directions in air VX, VY, VZ and OK of the pixels PX, PY."""
-    inv_fx, inv_fy, cx, cy = 1.0 / lens[0], 1.0 / lens[1], lens[2], lens[3]
-    limit, params = lens[13], coefficients(lens)
+    inv_fx, inv_fy, cx, cy = 1.0 / lens[FX], 1.0 / lens[FY], lens[CX], lens[CY]
+    limit, params = lens[LIMIT], coefficients(lens)
     for i in range(BLOCK):
         buffer[VX * STRIDE + i] = (buffer[PX * STRIDE + i] - cx) * inv_fx
         buffer[VY * STRIDE + i] = (buffer[PY * STRIDE + i] - cy) * inv_fy
         buffer[OK * STRIDE + i] = 1.0
-    if lens[12] == FISHEYE:
+    if lens[KIND] == FISHEYE:
         for i in range(BLOCK):
             xd, yd = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
             target = math.sqrt(xd * xd + yd * yd)
@@ -171,9 +172,9 @@ def dir_lanes(lens, buffer):
             buffer[VZ * STRIDE + i] = cosine
             buffer[OK * STRIDE + i] = 1.0 if ok > 0.0 else 0.0
         return
-    if lens[12] > FISHEYE:
+    if lens[KIND] > FISHEYE:
         _none(buffer)
-    if lens[12] == BROWN:
+    if lens[KIND] == BROWN:
         for i in range(BLOCK):
             xd, yd = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
             u, v, _ = _undistort_step(xd, yd, xd, yd, params)

@@ -15,6 +15,23 @@ from typing import Final
 
 from uwsfm._base.jit import inner
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import (
+    ALPHA,
+    BETA,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    KIND,
+    LIMIT,
+    OMEGA,
+    P1,
+    P2,
+    SX,
+    SY,
+)
 
 FOV: Final = 3
 EUCM: Final = 4
@@ -25,12 +42,12 @@ _NEAR: Final = 0.02
 
 def fov_limit(row: Array) -> float:
     """Squared radius up to which a lens of this kind is one to one: any."""
-    return math.inf if 0.0 < row[4] < math.pi else 0.0
+    return math.inf if 0.0 < row[OMEGA] < math.pi else 0.0
 
 
 def eucm_limit(row: Array) -> float:
     """Where d(r / d) / dr = 0, d = alpha sqrt(beta r^2 + 1) + 1 - alpha: squared r."""
-    alpha, beta = row[4], row[5]
+    alpha, beta = row[ALPHA], row[BETA]
     if not (alpha >= 0.0 and beta > 0.0):
         return 0.0
     if alpha <= 1.0:
@@ -43,16 +60,16 @@ def distort_wide(u, v, lens):
     """As `uwsfm.models.lens.distort`, of the kinds of this module."""
     nan = math.nan
     s = u * u + v * v
-    if lens[12] == THIN_PRISM:
+    if lens[KIND] == THIN_PRISM:
         return _thin_prism(u, v, lens)
-    if not s < lens[13]:
+    if not s < lens[LIMIT]:
         return nan, nan, nan, nan, nan, nan
-    if lens[12] == FOV:
+    if lens[KIND] == FOV:
         scale, scale_r, _ = _fov_scale(s, lens)
     else:
-        q = math.sqrt(lens[5] * s + 1.0)
-        scale = 1.0 / (lens[4] * q + 1.0 - lens[4])
-        scale_r = -lens[4] * lens[5] / q * scale * scale
+        q = math.sqrt(lens[BETA] * s + 1.0)
+        scale = 1.0 / (lens[ALPHA] * q + 1.0 - lens[ALPHA])
+        scale_r = -lens[ALPHA] * lens[BETA] / q * scale * scale
     return scaled(u, v, scale, scale_r)
 
 
@@ -80,7 +97,7 @@ def scaled(u, v, scale, scale_r):
 def _fov_scale(s, lens):
     """atan(r t) / (r omega) with t = 2 tan(omega / 2), s = r^2; its derivatives by r,
     over r, and by omega."""
-    omega = lens[4]
+    omega = lens[OMEGA]
     t = 2.0 * math.tan(0.5 * omega)
     x2 = s * t * t
     slope = 1.0 / (1.0 + x2)
@@ -111,8 +128,8 @@ def _prism_plane(u, v):
 @inner
 def _prism(a, b, lens):
     """Distorted (a, b) of the plane of angles, and derivatives as 4 scalars."""
-    k1, k2, p1, p2, k3, k4 = lens[4], lens[5], lens[6], lens[7], lens[8], lens[9]
-    sx, sy = lens[10], lens[11]
+    k1, k2, p1, p2, k3, k4 = lens[K1], lens[K2], lens[P1], lens[P2], lens[K3], lens[K4]
+    sx, sy = lens[SX], lens[SY]
     s = a * a + b * b
     radial = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
     radial_s = k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * 4.0 * k4))
@@ -129,7 +146,7 @@ def _thin_prism(u, v, lens):
     nan = math.nan
     a, b, au, av, _, bv = _prism_plane(u, v)
     x, y, xa, xb, ya, yb = _prism(a, b, lens)
-    if not (a * a + b * b < lens[13] * lens[13] and xa * yb - xb * ya > 0.0):
+    if not (a * a + b * b < lens[LIMIT] * lens[LIMIT] and xa * yb - xb * ya > 0.0):
         return nan, nan, nan, nan, nan, nan
     return (
         x,
@@ -146,24 +163,24 @@ def dir_from_wide(xd, yd, lens):
     """Unit direction of a distorted place; NaN where none leads there."""
     nan = math.nan
     s = xd * xd + yd * yd
-    if lens[12] == THIN_PRISM:
+    if lens[KIND] == THIN_PRISM:
         return _dir_from_prism(xd, yd, lens)
-    if lens[12] == FOV:
-        angle = math.sqrt(s) * lens[4]
+    if lens[KIND] == FOV:
+        angle = math.sqrt(s) * lens[OMEGA]
         if not angle < 0.5 * math.pi:
             return nan, nan, nan
-        z = 2.0 * math.tan(0.5 * lens[4])
+        z = 2.0 * math.tan(0.5 * lens[OMEGA])
         if angle > 1e-9:
             z *= math.sqrt(s) / math.tan(angle)
         else:
-            z /= lens[4]
+            z /= lens[OMEGA]
     else:
-        alpha, beta = lens[4], lens[5]
+        alpha, beta = lens[ALPHA], lens[BETA]
         root = 1.0 - (2.0 * alpha - 1.0) * beta * s
         if not root >= 0.0:
             return nan, nan, nan
         z = (1.0 - beta * alpha * alpha * s) / (alpha * math.sqrt(root) + 1.0 - alpha)
-        if not s < lens[13] * z * z:
+        if not s < lens[LIMIT] * z * z:
             return nan, nan, nan
     if not z > 0.0:
         return nan, nan, nan
@@ -175,7 +192,7 @@ def dir_from_wide(xd, yd, lens):
 def _dir_from_prism(xd, yd, lens):
     """Newton on the plane of angles, halved where it would leave the lens."""
     nan = math.nan
-    a, b, limit2 = xd, yd, lens[13] * lens[13]
+    a, b, limit2 = xd, yd, lens[LIMIT] * lens[LIMIT]
     s = a * a + b * b
     if not s < 0.81 * limit2:  # near the limit the slope is too flat to start from
         shrink = 0.9 * math.sqrt(limit2 / s)
@@ -203,10 +220,10 @@ def _dir_from_prism(xd, yd, lens):
 @inner
 def wide_by_params(u, v, lens, jac):
     """Columns 4 to 11 of `uwsfm.models.lens.jac_by_params`, of the kinds here."""
-    fx, fy = lens[0], lens[1]
+    fx, fy = lens[FX], lens[FY]
     for k in range(4, 12):
         jac[0, k], jac[1, k] = 0.0, 0.0
-    if lens[12] == THIN_PRISM:
+    if lens[KIND] == THIN_PRISM:
         a, b, _, _, _, _ = _prism_plane(u, v)
         s = a * a + b * b
         power = s
@@ -218,17 +235,17 @@ def wide_by_params(u, v, lens, jac):
         jac[0, 10], jac[1, 11] = fx * s, fy * s
         return
     s = u * u + v * v
-    if lens[12] == FOV:
+    if lens[KIND] == FOV:
         _, _, by_omega = _fov_scale(s, lens)
         jac[0, 4], jac[1, 4] = fx * u * by_omega, fy * v * by_omega
         return
-    q = math.sqrt(lens[5] * s + 1.0)
-    scale = 1.0 / (lens[4] * q + 1.0 - lens[4])
-    by_alpha, by_beta = (1.0 - q) * scale**2, -0.5 * lens[4] * s / q * scale**2
+    q = math.sqrt(lens[BETA] * s + 1.0)
+    scale = 1.0 / (lens[ALPHA] * q + 1.0 - lens[ALPHA])
+    by_alpha, by_beta = (1.0 - q) * scale**2, -0.5 * lens[ALPHA] * s / q * scale**2
     jac[0, 4], jac[1, 4] = fx * u * by_alpha, fy * v * by_alpha
     jac[0, 5], jac[1, 5] = fx * u * by_beta, fy * v * by_beta
 
 
 def wide_limit(row: Array) -> float:
     """``limit`` of a row of this module's kinds; of THIN_PRISM see the fisheye's."""
-    return fov_limit(row) if row[12] == FOV else eucm_limit(row)
+    return fov_limit(row) if row[KIND] == FOV else eucm_limit(row)

@@ -2,8 +2,8 @@
 
 Names in Refractive COLMAP: `CamFromImgRefrac` is `unproject`, `ImgFromCamRefrac` is
 `project`. Scalar kernels work on one port row and one lens row; the batch kernels
-below them only loop. All points and rays are in the camera frame, in metres. What a
-flat port and a dome do differently is in `flat` and `dome`.
+below them only loop. All points and rays are in the camera frame, in metres. What
+kinds of ports do differently is behind `uwsfm.models.ports.dispatch`.
 """
 
 import math
@@ -26,19 +26,14 @@ from uwsfm.models.lanes import (
 )
 from uwsfm.models.lens import dir_from_img, img_from_dir, jac_by_params
 from uwsfm.models.lens_lanes import dir_lanes, img_lanes
-from uwsfm.models.ports.dome import dome_air_ray, dome_jac, dome_water_ray
-from uwsfm.models.ports.dome_lanes import (
-    dome_air_lanes,
-    dome_jac_lanes,
-    dome_ray_lanes,
+from uwsfm.models.ports.dispatch import (
+    port_air_lanes,
+    port_air_ray,
+    port_jac,
+    port_jac_lanes,
+    port_ray_lanes,
+    port_water_ray,
 )
-from uwsfm.models.ports.flat import flat_air_ray, flat_jac, flat_water_ray
-from uwsfm.models.ports.flat_lanes import (
-    flat_air_lanes,
-    flat_jac_lanes,
-    flat_ray_lanes,
-)
-from uwsfm.models.ports.port import DOME, KIND
 from uwsfm.models.status import (
     BEHIND_CAMERA,
     NOT_FINITE,
@@ -47,8 +42,8 @@ from uwsfm.models.status import (
 )
 
 JAC_SIZE = 10
-"""Columns of the Jacobian: point (3); normal (2, tangent) and distance of a flat port,
-or centre (3) of a dome; thickness, n_glass, n_water; radius of a dome."""
+"""Columns of the Jacobian: point (3); normal (2, tangent) and distance of a plane, or
+centre (3) of a dome; thickness, n_glass, n_water; radius of a dome."""
 
 
 @inner
@@ -61,9 +56,7 @@ def water_ray_from_dir(dx, dy, dz, port):
     if not abs(dx) + abs(dy) + abs(dz) < math.inf:
         nan = math.nan
         return OUTSIDE_LENS, nan, nan, nan, nan, nan, nan
-    if port[KIND] == DOME:
-        return dome_water_ray(dx, dy, dz, port)
-    return flat_water_ray(dx, dy, dz, port)
+    return port_water_ray(dx, dy, dz, port)
 
 
 @inner
@@ -82,9 +75,7 @@ def air_ray(x, y, z, port):
     if not abs(x) + abs(y) + abs(z) < math.inf:
         nan = math.nan
         return NOT_FINITE, nan, nan, nan, nan
-    if port[KIND] == DOME:
-        return dome_air_ray(x, y, z, port)
-    return flat_air_ray(x, y, z, port)
+    return port_air_ray(x, y, z, port)
 
 
 @inner
@@ -122,10 +113,7 @@ def project_with_jac(x, y, z, lens, port, jac):
     if not abs(px) + abs(py) < math.inf:
         return OUTSIDE_LENS, math.nan, math.nan
     rows = (a1, a2, a3, b1, b2, b3)
-    if port[KIND] == DOME:
-        dome_jac(x, y, z, root, port, rows, jac)
-    else:
-        flat_jac(x, y, z, root, port, rows, jac)
+    port_jac(x, y, z, root, port, rows, jac)
     return VALID, px, py
 
 
@@ -137,36 +125,16 @@ def lens_jac_of_point(x, y, z, lens, port, jac):
 
 
 @inner
-def air_lanes(port, buffer):
-    """Rays in air of the points of a buffer, see `uwsfm.models.lanes`."""
-    if port[KIND] == DOME:
-        dome_air_lanes(port, buffer)
-    else:
-        flat_air_lanes(port, buffer)
-
-
-@inner
 def project_lanes(lens, port, buffer):
     """PX, PY and d(pixel) / dv of points X, Y, Z; lanes that are not OK are undone."""
-    air_lanes(port, buffer)
+    port_air_lanes(port, buffer)
     img_lanes(lens, buffer)
 
 
 @inner
 def jac_lanes(port, buffer):
     """JAC_SIZE columns of the Jacobian, after `project_lanes`."""
-    if port[KIND] == DOME:
-        dome_jac_lanes(port, buffer)
-    else:
-        flat_jac_lanes(port, buffer)
-
-
-@inner
-def _unproject_rays(port, buffer):
-    if port[KIND] == DOME:
-        dome_ray_lanes(port, buffer)
-    else:
-        flat_ray_lanes(port, buffer)
+    port_jac_lanes(port, buffer)
 
 
 @inner
@@ -186,7 +154,7 @@ def unproject_batch(xy, lens, port, rays, status):
         count = min(BLOCK, len(xy) - first)
         load_rows(xy, first, count, PX, 2, buffer)
         dir_lanes(lens, buffer)
-        _unproject_rays(port, buffer)
+        port_ray_lanes(port, buffer)
         _take_rays(first, count, buffer, rays, status)
         for i in range(count):
             if buffer[OK * STRIDE + i] == 1.0:

@@ -11,7 +11,7 @@ from uwsfm.geometry.rigid3 import Array
 from uwsfm.models import projection
 from uwsfm.models.lens import SUPPORTED_MODELS, lens_row, param_slots
 from uwsfm.models.ports.caustic import caustic_points
-from uwsfm.models.ports.port import FlatPort, Port
+from uwsfm.models.ports.port import KINDS, PlanePort, Port
 from uwsfm.models.status import VALID
 
 StatusArray = NDArray[np.uint8]
@@ -59,7 +59,8 @@ class RefractiveCamera:
             raise InputError(f"camera must be a pycolmap.Camera, got {camera!r}")
         if not isinstance(port, Port):
             raise InputError(
-                f"port must be a FlatPort, a DomePort or NoPort(), got {port!r}"
+                f"port must be one of {', '.join(k.__name__ for k in KINDS)}, got "
+                f"{port!r}"
             )
         self._camera = camera
         self._port = port
@@ -140,11 +141,11 @@ class RefractiveCamera:
             NaN where the pixel has no ray.
 
         Raises:
-            InputError: the port is not flat.
+            InputError: the port is no plane.
         """
-        if not isinstance(self._port, FlatPort):
+        if not isinstance(self._port, PlanePort):
             raise InputError(
-                f"the caustic is known of flat ports only, not of {self._port}"
+                f"the caustic is known of planes only, not of {self._port}"
             )
         return caustic_points(*self.ray_from_img(xy), self._port)
 

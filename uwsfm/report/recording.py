@@ -19,7 +19,6 @@ from uwsfm.export.scene_ply import camera_lines
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import NoPort
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.report.view import FRUSTUM_SHARE, strips
 from uwsfm.results.folder import Result, open_result
@@ -101,7 +100,7 @@ def _log_camera(rerun: ModuleType, stream: object, result: Result, index: int) -
     lines = camera_lines(camera, length, np.array(color, dtype=np.uint8))
     frustum = rerun.LineStrips3D(strips(lines.vertices, lines.edges), colors=[color])
     rerun.log(f"{world}/frustum", frustum, static=True, recording=stream)
-    if not isinstance(camera.port, NoPort):
+    if camera.port.refracts:
         vertices, triangles = port_mesh(camera)
         glass = rerun.Mesh3D(
             vertex_positions=vertices,

@@ -21,6 +21,7 @@ from uwsfm.calibration.result import Covariance
 from uwsfm.colmap.model import Model
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.ports.port import kind_of_word
 from uwsfm.report.words import (
     deviation,
     rounded,
@@ -82,22 +83,24 @@ _Both = tuple[float | None, float | None]
 
 def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     (unit, scale), group = small_lengths(summary), camera["name"]
-    if camera["port"] == "none":
-        return [_row(group, "port", "none", ("", ""), "", "given")]
-    if camera["port"] == "dome":
+    kind = kind_of_word(camera["port"])
+    if not kind.refracts:
+        return [_row(group, "port", kind.word, ("", ""), "", "given")]
+    rows: list[Estimate] = []
+    if kind.has("center"):
         both = zip(
             camera["center_stddev_m"], camera["center_stddev_in_all_m"], strict=True
         )
         word = camera["center_verdict"]
-        rows = [
+        rows += [
             _number(group, f"dome centre {axis}", value, stddevs, (unit, scale), word)
             for axis, value, stddevs in zip(
                 "xyz", camera["center_m"], both, strict=True
             )
         ]
-    else:
+    if kind.has("normal"):
         word = camera["normal_verdict"]
-        rows = [
+        rows += [
             _number(group, f"port tilt {axis}", value, (own, total), ("deg", 1.0), word)
             for axis, (value, own, total) in zip("xy", tilts_of(camera), strict=True)
         ]
@@ -117,7 +120,7 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> list[Estimate]:
     return rows + [
         _given(group, each, camera)
         for each in OF_PORTS
-        if each.listed and camera["port"] in each.ports
+        if each.listed and each.of(kind)
         if not was_refined(summary, each, group)
     ]
 
@@ -239,9 +242,9 @@ def budget_columns(summary: dict[str, Any]) -> tuple[str, ...]:
     unit, columns = small_lengths(summary)[0], []
     for camera in summary["cameras"]:
         name = camera["name"]
-        if camera["port"] == "flat":
+        if "normal" in camera:
             columns += [f"{name}: tilt (deg)", f"{name}: distance ({unit})"]
-        elif camera["port"] == "dome":
+        if "center_m" in camera:
             columns.append(f"{name}: centre ({unit})")
     return (*columns, "lengths (%)")
 
@@ -260,10 +263,10 @@ def budget_lines(summary: dict[str, Any]) -> tuple[BudgetLine, ...]:
     for row in summary.get("error_budget", ()):
         effects = []
         for camera, shift in zip(summary["cameras"], row["cameras"], strict=True):
-            if camera["port"] == "flat":
+            if "normal" in camera:
                 effects.append(_effect(shift["tilt_deg"], 1.0))
                 effects.append(_effect(shift["distance_m"], scale))
-            elif camera["port"] == "dome":
+            if "center_m" in camera:
                 effects.append(", ".join(_effect(v, scale) for v in shift["center_m"]))
         effects.append(_effect(row["scale"], 1e2))
         lines.append(

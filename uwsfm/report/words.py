@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from uwsfm.models.ports.port import kind_of_word
 from uwsfm.results.verdict_summary import DOUBTFUL_WORD, WITHHELD, verdict_line
 
 ARBITRARY_UNIT = "scale arbitrary"
@@ -227,9 +228,10 @@ def _source(summary: dict[str, Any]) -> str:
 
 def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
     name, small = camera["name"], small_lengths(summary)
-    if camera["port"] == "none":
-        return PortVerdict(camera=name, text="no port", words=())
-    if camera["port"] == "dome":
+    kind = kind_of_word(camera["port"])
+    if not kind.refracts:
+        return PortVerdict(camera=name, text=kind.noun, words=())
+    if kind.has("center"):
         parts = zip(
             camera["center_m"],
             camera["center_stddev_m"],
@@ -239,7 +241,7 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
         center = ", ".join(with_deviations(v, s, t, small) for v, s, t in parts)
         return PortVerdict(
             camera=name,
-            text=f"dome, its centre at {center} from the projection centre",
+            text=f"{kind.noun}, its centre at {center} from the projection centre",
             words=(("centre", camera["center_verdict"]),),
         )
     tilt = " and ".join(
@@ -254,7 +256,7 @@ def _port(camera: dict[str, Any], summary: dict[str, Any]) -> PortVerdict:
     )
     return PortVerdict(
         camera=name,
-        text=f"flat port, its normal tilted by {tilt}, at {distance} from the "
+        text=f"{kind.noun}, its normal tilted by {tilt}, at {distance} from the "
         "projection centre",
         words=(
             ("tilt", camera["normal_verdict"]),

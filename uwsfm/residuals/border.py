@@ -12,10 +12,12 @@ DIRECTION: Final = slice(3, 5)
 """Of cam_from_rig's translation, radians."""
 LENGTH: Final = 5
 """Of cam_from_rig's translation, metres."""
+PLACE: Final = slice(6, 9)
+"""Of a port: what the next three say of its kind. All of it but the radius."""
 NORMAL: Final = slice(6, 8)
-"""Of a flat port, radians."""
+"""Of a plane, radians."""
 DISTANCE: Final = 8
-"""Of a flat port, metres."""
+"""Of a plane, metres."""
 CENTER: Final = slice(6, 9)
 """Of a dome, metres: it has no normal and no distance."""
 WATER_INDEX: Final = 9

@@ -13,6 +13,16 @@ import math
 from uwsfm._base.jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot, scaled
+from uwsfm.models.ports.row import (
+    DISTANCE,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    NX,
+    NY,
+    NZ,
+    THICKNESS,
+)
 from uwsfm.models.status import BEHIND_CAMERA, NO_INTERSECTION, NOT_FINITE, VALID
 from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.residuals.water_ray import slope_by_index, slope_by_u, water_ray
@@ -38,8 +48,12 @@ def _ray_in_rig(v, cam, port):
     status, _, s_g, s_w, w = water_ray(v, port)
     if status != VALID:
         return status, none, none
-    n = (port[0], port[1], port[2])
-    origin = add(scaled(port[3] + port[4], n), port[3] + port[4] * s_g, w)
+    n = (port[NX], port[NY], port[NZ])
+    origin = add(
+        scaled(port[DISTANCE] + port[THICKNESS], n),
+        port[DISTANCE] + port[THICKNESS] * s_g,
+        w,
+    )
     origin = add(origin, -1.0, (cam[3], cam[7], cam[11]))
     rho = add(n, s_w, w)
     unit = scaled(1.0 / math.sqrt(dot(rho, rho)), rho)
@@ -95,7 +109,7 @@ def _triangulate(x, y, z, dirs, camera, first, last, cams, ports):
     for i in range(first, last):
         port = ports[camera[i]]
         in_cam = point_in_rig(cams[camera[i]], add(point, 1.0, e))
-        if not dot(port, in_cam) > port[3] + port[4]:
+        if not dot(port, in_cam) > port[DISTANCE] + port[THICKNESS]:
             return BEHIND_CAMERA, lost, none
     return VALID, e, inverse
 
@@ -164,18 +178,21 @@ def _by_camera(met, v, cam, arm, port, jac):
     do = (o - t) x w, drho = rho x w, and a shift dt by do = -dt.
     """
     _, a, s_g, s_w, w = water_ray(v, port)
-    n = (port[0], port[1], port[2])
+    n = (port[NX], port[NY], port[NZ])
     rho = add(n, s_w, w)
     inv = 1.0 / dot(rho, rho)
-    level, side = port[3] + port[4], port[3] + port[4] * s_g
+    level, side = (
+        port[DISTANCE] + port[THICKNESS],
+        port[DISTANCE] + port[THICKNESS] * s_g,
+    )
     origin = add(scaled(level, n), side, w)
     in_cam = point_in_rig(cam, met)
     from_origin = add(in_cam, -1.0, origin)
     c = dot(rho, from_origin) * inv
     m = add(from_origin, -c, rho)
     _turn_and_shift(add(in_cam, -1.0, m), m, rho, inv, cam, arm, jac)
-    n_air, thick = port[5], port[4]
-    n_glass, n_water = port[6] / n_air, port[7] / n_air
+    n_air, thick = port[N_AIR], port[THICKNESS]
+    n_glass, n_water = port[N_GLASS] / n_air, port[N_WATER] / n_air
     g_u, w_u = thick * slope_by_u(n_glass, s_g), slope_by_u(n_water, s_w)
     t11, t12, t13, t21, t22, t23 = tangents(n[0], n[1], n[2])
     for k in range(2):

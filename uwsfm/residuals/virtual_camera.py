@@ -19,6 +19,16 @@ import math
 from uwsfm._base.jit import inner
 from uwsfm.geometry.unit_vector import tangents
 from uwsfm.geometry.vec3 import add, dot
+from uwsfm.models.ports.row import (
+    DISTANCE,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    NX,
+    NY,
+    NZ,
+    THICKNESS,
+)
 from uwsfm.models.status import BEHIND_CAMERA, NOT_FINITE, VALID
 from uwsfm.residuals.reprojection import point_in_rig
 from uwsfm.residuals.water_ray import slope_by_index, slope_by_u, water_ray
@@ -55,11 +65,11 @@ def _miss(x, y, z, v, port, tangential):
     status, a, s_g, s_w, w = water_ray(v, port)
     if status != VALID:
         return status, nan, nan, nan, nan, nan, nan, none, none
-    point, dist, thick = (x, y, z), port[3], port[4]
+    point, dist, thick = (x, y, z), port[DISTANCE], port[THICKNESS]
     depth = dot(port, point)
     height = depth - dist - thick
-    c_g, _, _ = _focus(port[6] / port[5], s_g, a, tangential)
-    c_w, _, _ = _focus(port[7] / port[5], s_w, a, tangential)
+    c_g, _, _ = _focus(port[N_GLASS] / port[N_AIR], s_g, a, tangential)
+    c_w, _, _ = _focus(port[N_WATER] / port[N_AIR], s_w, a, tangential)
     focal = (dist + thick * c_g) / c_w
     if not focal + height > 0.0:
         return BEHIND_CAMERA, nan, nan, nan, nan, nan, nan, none, none
@@ -86,7 +96,7 @@ def residual(x, y, z, v, cam, port, tangential):
     """
     px, py, pz = point_in_rig(cam, (x, y, z))
     status, _, _, _, depth, _, focal, _, g = _miss(px, py, pz, v, port, tangential)
-    shrink = focal / (focal + depth - port[3] - port[4])
+    shrink = focal / (focal + depth - port[DISTANCE] - port[THICKNESS])
     return status, shrink * g[0], shrink * g[1], shrink * g[2]
 
 
@@ -111,7 +121,7 @@ def residual_with_jac(x, y, z, v, cam, arm, port, tangential, j_rig, j_border):
     status, _, _, _, depth, _, focal, _, g = miss
     if status != VALID:
         return status, math.nan, math.nan, math.nan
-    shrink = focal / (focal + depth - port[3] - port[4])
+    shrink = focal / (focal + depth - port[DISTANCE] - port[THICKNESS])
     _by_point_and_port((px, py, pz), v, port, tangential, miss, j_border)
     _chain_to_pose((px - cam[3], py - cam[7], pz - cam[11]), cam, arm, j_rig, j_border)
     return status, shrink * g[0], shrink * g[1], shrink * g[2]
@@ -131,9 +141,9 @@ def _by_point_and_port(point, v, port, tangential, miss, j_border):
         d/dn_i = nu f_i g - mu L_i w
     """
     _, a, s_g, s_w, depth, reach, focal, w, g = miss
-    n_air, thick = port[5], port[4]
-    n_glass, n_water = port[6] / n_air, port[7] / n_air
-    height = depth - port[3] - thick
+    n_air, thick = port[N_AIR], port[THICKNESS]
+    n_glass, n_water = port[N_GLASS] / n_air, port[N_WATER] / n_air
+    height = depth - port[DISTANCE] - thick
     f_dist, f_thick, f_glass, f_water, f_u = _focal_jac(
         focal, a, s_g, s_w, port, tangential
     )
@@ -143,7 +153,7 @@ def _by_point_and_port(point, v, port, tangential, miss, j_border):
     by_u = thick * slope_by_u(n_glass, s_g) + height * slope_by_u(n_water, s_w)
     by_glass = thick * slope_by_index(n_glass, s_g, a)
     by_water = height * slope_by_index(n_water, s_w, a)
-    t11, t12, t13, t21, t22, t23 = tangents(port[0], port[1], port[2])
+    t11, t12, t13, t21, t22, t23 = tangents(port[NX], port[NY], port[NZ])
     first, second = (t11, t12, t13), (t21, t22, t23)
     x_1, v_1 = dot(point, first), dot(v, first)
     x_2, v_2 = dot(point, second), dot(v, second)
@@ -167,9 +177,9 @@ def _by_point_and_port(point, v, port, tangential, miss, j_border):
 @inner
 def _focal_jac(focal, a, s_g, s_w, port, tangential):
     """Derivatives of f by d, t, n_g, n_w (relative to air) and u."""
-    thick = port[4]
-    c_g, c_g_u, c_g_index = _focus(port[6] / port[5], s_g, a, tangential)
-    c_w, c_w_u, c_w_index = _focus(port[7] / port[5], s_w, a, tangential)
+    thick = port[THICKNESS]
+    c_g, c_g_u, c_g_index = _focus(port[N_GLASS] / port[N_AIR], s_g, a, tangential)
+    c_w, c_w_u, c_w_index = _focus(port[N_WATER] / port[N_AIR], s_w, a, tangential)
     by_dist = 1.0 / c_w
     return (
         by_dist,

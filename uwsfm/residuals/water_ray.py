@@ -13,6 +13,7 @@ import math
 
 from uwsfm._base.jit import inner
 from uwsfm.geometry.refraction import slope
+from uwsfm.models.ports.row import N_AIR, N_GLASS, N_WATER, NX, NY, NZ
 from uwsfm.models.status import MISSES_PORT, OUTSIDE_LENS, TOTAL_REFLECTION, VALID
 
 
@@ -24,7 +25,7 @@ def water_ray(v, port):
     """
     nan = math.nan
     vx, vy, vz = v[0], v[1], v[2]
-    nx, ny, nz = port[0], port[1], port[2]
+    nx, ny, nz = port[NX], port[NY], port[NZ]
     if not abs(vx) + abs(vy) + abs(vz) < math.inf:
         return OUTSIDE_LENS, nan, nan, nan, (nan, nan, nan)
     a = nx * vx + ny * vy + nz * vz
@@ -32,7 +33,7 @@ def water_ray(v, port):
         return MISSES_PORT, nan, nan, nan, (nan, nan, nan)
     inv_a = 1.0 / a
     u = inv_a * inv_a - 1.0
-    n_glass, n_water = port[6] / port[5], port[7] / port[5]
+    n_glass, n_water = port[N_GLASS] / port[N_AIR], port[N_WATER] / port[N_AIR]
     low = min(n_glass, n_water) ** 2
     if not low + (low - 1.0) * u > 0.0:
         return TOTAL_REFLECTION, nan, nan, nan, (nan, nan, nan)

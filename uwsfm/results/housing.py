@@ -13,7 +13,7 @@ from uwsfm.calibration.named_covariance import without_names
 from uwsfm.calibration.observability import center_verdict, distance_verdict
 from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.results.refined import RefinedNumber, refined_numbers
 from uwsfm.results.verdict_summary import shown_word
 from uwsfm.rig.file import dump_rig
@@ -150,8 +150,8 @@ def _comments(
             f"center: standard deviation {own} {unit} from the images, {total} in all: "
             f"{word}"
         )
-    if isinstance(port, FlatPort):
-        lines += _flat_comments(camera, port, (cov, in_all), unit, verdict)
+    if isinstance(port, PlanePort):
+        lines += _plane_comments(camera, port, (cov, in_all), unit, verdict)
     if index > 0 and calibration.options.refine_cam_from_rig:
         lines.append(
             f"rotation: standard deviation {cov.rotation_stddev_deg:.4f} deg from the "
@@ -161,9 +161,9 @@ def _comments(
     return lines
 
 
-def _flat_comments(
+def _plane_comments(
     camera: RigCamera,
-    port: FlatPort,
+    port: PlanePort,
     both: tuple[CameraCovariance, CameraCovariance],
     unit: str,
     verdict: str,

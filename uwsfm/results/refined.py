@@ -21,7 +21,6 @@ from uwsfm.calibration.parameters import (
     lens_parameter,
 )
 from uwsfm.calibration.prior_verdicts import prior_verdict
-from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.relinearized import reopened
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import border_covariance
@@ -138,7 +137,7 @@ def _places(rig: Rig, calibration: CalibrationResult) -> Iterator[_Place]:
         name = BASELINE.listed_name(item.name)
         yield _Place(BASELINE, c, BASELINE.first, name, length)
         for each in OF_PORTS:
-            has = port_kind(scene.ports[c]) in each.ports
+            has = each.of(scene.ports[c])
             if has and each.listed and each is not WATER_INDEX:
                 value = float(scene.ports[c].row[each.column])
                 name = each.listed_name(item.name)

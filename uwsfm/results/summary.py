@@ -22,7 +22,7 @@ from uwsfm.calibration.observability import (
 )
 from uwsfm.calibration.result import CalibrationResult, CameraCovariance
 from uwsfm.calibration.tilt import paper_tilt, slope_stddevs_deg, turn_stddevs_deg
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.rig.rig import Rig, RigCamera
 from uwsfm.scene import Scene
 
@@ -83,26 +83,23 @@ def _port_summary(
 ) -> dict[str, Any]:
     """What is known of a port; what is measured has the names of the rig file."""
     port = calibration.scene.ports[index]
-    if isinstance(port, NoPort):
-        return {"port": "none"}
+    stated = {"port": port.word, **port.stated()}
+    if not port.refracts:
+        return stated
     cov = calibration.covariance.cameras[index]
     in_all = calibration.covariance.judged_cameras[index]
+    estimates: dict[str, Any] = {}
     if isinstance(port, DomePort):
-        place = _dome_summary(camera, port, cov, in_all)
-    else:
+        estimates = _dome_summary(camera, port, cov, in_all)
+    if isinstance(port, PlanePort):
         own, total = slope_stddevs_deg(calibration, index)
-        place = {
-            **_flat_summary(camera, port, cov, in_all),
+        estimates = {
+            **_plane_summary(camera, port, cov, in_all),
             "tilt_xy_stddev_deg": own,
             "tilt_xy_stddev_in_all_deg": total,
             **asdict(paper_tilt(calibration, index)),
         }
-    return {
-        **place,
-        "thickness_m": port.thickness,
-        "glass_index": port.n_glass,
-        "water_index": port.n_water,
-    }
+    return {**stated, **estimates, "water_index": port.n_water}
 
 
 def _dome_summary(
@@ -110,26 +107,23 @@ def _dome_summary(
 ) -> dict[str, Any]:
     refined = camera.refine_center
     return {
-        "port": "dome",
-        "center_m": list(port.center),
         "center_stddev_m": [_stddev(v, refined) for v in cov.center_stddev_m],
         "center_stddev_in_all_m": [_stddev(v, True) for v in in_all.center_stddev_m],
         "center_verdict": center_verdict(port.radius, in_all, refined),
-        "radius_m": port.radius,
     }
 
 
-def _flat_summary(
-    camera: RigCamera, port: FlatPort, cov: CameraCovariance, in_all: CameraCovariance
+def _plane_summary(
+    camera: RigCamera,
+    port: PlanePort,
+    cov: CameraCovariance,
+    in_all: CameraCovariance,
 ) -> dict[str, Any]:
     free = not cov.distance_at_zero
     return {
-        "port": "flat",
-        "normal": list(port.normal),
         "normal_stddev_deg": _stddev(cov.normal_stddev_deg, camera.refine_normal),
         "normal_stddev_in_all_deg": _stddev(in_all.normal_stddev_deg, True),
         "normal_verdict": normal_verdict(in_all, camera.refine_normal),
-        "distance_m": port.distance,
         "distance_stddev_m": _stddev(
             cov.distance_stddev_m, camera.refine_distance and free
         ),

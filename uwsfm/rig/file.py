@@ -23,10 +23,10 @@ from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.calibration.parameters import OF_RIG
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import IDENTITY
-from uwsfm.models.ports.port import DomePort, NoPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.residuals import border
 from uwsfm.rig.problems import first_problem
-from uwsfm.rig.rig import Rig, RigCamera
+from uwsfm.rig.rig import Rig, RigCamera, refine_flags
 from uwsfm.rig.schema import CameraEntry, RadialUndistortionLens, RigFile
 from uwsfm.rig.values import ACCURACIES, IMPLAUSIBLE_ALLOWED, checked_baseline
 
@@ -135,13 +135,13 @@ GLASSY = 1.42
 
 def _check_order(port: Port) -> None:
     """Refuse glass and water whose indices are exchanged, or that no window has."""
-    if not isinstance(port, NoPort) and port.n_glass < port.n_water > GLASSY:
+    if port.refracts and port.n_glass < port.n_water > GLASSY:
         raise InputError(
             f"water.refractive_index: {port.n_water:g} is the index of a glass, and "
             f"glass_index {port.n_glass:g} that of a liquid: are they exchanged? Water "
             "has about 1.333, glass 1.5"
         )
-    if isinstance(port, NoPort) or port.thickness == 0.0 or IMPLAUSIBLE_ALLOWED.get():
+    if not port.refracts or port.thickness == 0.0 or IMPLAUSIBLE_ALLOWED.get():
         return
     if port.n_glass < port.n_water:
         raise InputError(
@@ -164,9 +164,7 @@ def _rig_camera(entry: CameraEntry, n_water: float) -> RigCamera:
         images=entry.images,
         camera=camera,
         port=port.to_port(n_water),
-        refine_normal="normal" in port.refine,
-        refine_distance="distance" in port.refine,
-        refine_center="center" in port.refine,
+        **refine_flags(port.refined),
         valid_radius_px=lens.valid_radius_px,
         conversion_max_px=conversion.max_px if conversion else None,
         conversion_rms_px=conversion.rms_px if conversion else None,
@@ -308,39 +306,23 @@ def _shared_accuracy(accuracy: RigAccuracy) -> dict[str, Any]:
 def _common_water(rig: Rig) -> float:
     """The water index of the first port; of a rig without one, that of water, for the
     port that somebody may put there."""
-    indices = [c.port.n_water for c in rig.cameras if not isinstance(c.port, NoPort)]
+    indices = [c.port.n_water for c in rig.cameras if c.port.refracts]
     return indices[0] if indices else FRESH_WATER
 
 
 def _port_block(camera: RigCamera, n_water: float) -> dict[str, Any]:
     """The keys of a port, as the entries of `uwsfm.rig.schema` read them."""
     port = camera.port
-    if isinstance(port, NoPort):
-        return {"type": "none"}
     if port.n_air != 1.0:
         raise InputError(f"{camera.name}: a rig file has no key for an air index != 1")
-    if isinstance(port, DomePort):
-        refine = {"center": camera.refine_center}
-        place: dict[str, Any] = {
-            "type": "dome",
-            "center_m": list(port.center),
-            "radius_m": port.radius,
-        }
-    else:
-        refine = {"normal": camera.refine_normal, "distance": camera.refine_distance}
-        place = {
-            "type": "flat",
-            "normal": list(port.normal),
-            "distance_m": port.distance,
-        }
-    water = {} if port.n_water == n_water else {"water_index": port.n_water}
-    return {
-        **place,
-        "thickness_m": port.thickness,
-        "glass_index": port.n_glass,
-        **water,
-        "refine": [name for name, chosen in refine.items() if chosen],
-    }
+    block = {"type": port.word, **port.stated()}
+    if port.refracts and port.n_water != n_water:
+        block["water_index"] = port.n_water
+    if port.refinable:
+        block["refine"] = [
+            name for name in port.refinable if getattr(camera, f"refine_{name}")
+        ]
+    return block
 
 
 def _yaml(data: Any) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,18 @@ if TYPE_CHECKING:  # heavy: importing a rig must not load pycolmap or numba
 _MIN_FOCAL_PER_SIDE = 0.1
 
 
+def refine_flags(names: Iterable[str]) -> dict[str, Any]:
+    """The fields of a `RigCamera` that say what the images refine of its port.
+
+    Args:
+        names: of its port's ``refinable`` numbers; all others are held.
+    """
+    chosen = set(names)
+    return {
+        f"refine_{name}": name in chosen for name in ("normal", "distance", "center")
+    }
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigCamera:
     """One camera of a rig, behind its own port."""
@@ -38,7 +50,7 @@ class RigCamera:
     port: Port
     """In the camera frame; the initial value of whatever is refined."""
     refine_normal: bool = False
-    """Of a flat port; so the next."""
+    """Of a plane; so the next."""
     refine_distance: bool = False
     refine_center: bool = False
     """Of a dome."""

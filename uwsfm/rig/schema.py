@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Union
 
 import numpy as np
 from pydantic import (
@@ -15,6 +17,7 @@ from pydantic import (
     Field,
     Tag,
     ValidationInfo,
+    create_model,
     field_validator,
     model_validator,
 )
@@ -25,7 +28,8 @@ from uwsfm.calibration.given_accuracy import (
     RigAccuracy,
 )
 from uwsfm.geometry.rigid3 import Array, from_rotmat
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort
+from uwsfm.models.ports.kind import FILE_KEYS
+from uwsfm.models.ports.port import KINDS, Port
 from uwsfm.rig.covariance_file import named_covariance, read_covariance
 from uwsfm.rig.rig import (
     camera_from_colmap,
@@ -73,86 +77,82 @@ class WaterEntry(Entry):
     refractive_index: _Index
 
 
-_Thickness = Annotated[_Number, AfterValidator(checked_thickness)]
-_PORT_KINDS = ("flat", "dome", "none")
-_Kind = Literal["flat", "dome", "none"]
+def _distance(kind: type[Port]) -> Any:
+    check = partial(checked_port_distance, limit=kind.max_distance_m)
+    return Annotated[_Number, AfterValidator(check)]
 
 
-class FlatPortEntry(Entry):
-    type: _Kind
-    normal: Annotated[_Vector, AfterValidator(checked_normal)]
-    distance_m: Annotated[_Number, AfterValidator(checked_port_distance)]
-    thickness_m: _Thickness
-    glass_index: _Index
-    water_index: _Index | None = None
-    refine: Annotated[tuple[Literal["normal", "distance"], ...], Field(strict=False)]
-
-    def to_port(self, n_water: float) -> FlatPort:
-        x, y, z = self.normal
-        return FlatPort(
-            (x, y, z),
-            self.distance_m,
-            self.thickness_m,
-            self.glass_index,
-            self.water_index or n_water,
-        )
+_PORT_KEYS: dict[str, Callable[[type[Port]], Any]] = {
+    "normal": lambda kind: Annotated[_Vector, AfterValidator(checked_normal)],
+    "distance": _distance,
+    "center": lambda kind: Annotated[_Vector, AfterValidator(checked_center)],
+    "radius": lambda kind: Annotated[_Number, AfterValidator(checked_radius)],
+    "thickness": lambda kind: Annotated[_Number, AfterValidator(checked_thickness)],
+    "n_glass": lambda kind: _Index,
+}
+"""What each number of a port may be, by its kind."""
+_WORDS = tuple(kind.word for kind in KINDS)
 
 
-class DomePortEntry(Entry):
-    type: _Kind
-    center_m: Annotated[_Vector, AfterValidator(checked_center)]
-    radius_m: Annotated[_Number, AfterValidator(checked_radius)]
-    thickness_m: _Thickness
-    glass_index: _Index
-    water_index: _Index | None = None
-    refine: Annotated[tuple[Literal["center"], ...], Field(strict=False)]
+class PortEntry(Entry):
+    """A port; its keys are those of its kind, see `_entry`."""
+
+    kind: ClassVar[type[Port]]
+    type: Literal[_WORDS]  # type: ignore[valid-type]
+
+    def to_port(self, n_water: float) -> Port:
+        numbers = {name: getattr(self, FILE_KEYS[name]) for name in self.kind.numbers}
+        own: float | None = getattr(self, "water_index", None)
+        return self.kind.of_numbers(numbers, own or n_water)
 
     @model_validator(mode="after")
-    def _holds_the_camera(self) -> DomePortEntry:
+    def _is_one(self) -> PortEntry:
         self.to_port(1.333)
         return self
 
-    def to_port(self, n_water: float) -> DomePort:
-        x, y, z = self.center_m
-        return DomePort(
-            (x, y, z),
-            self.radius_m,
-            self.thickness_m,
-            self.glass_index,
-            self.water_index or n_water,
-        )
-
-
-class NoPortEntry(Entry):
-    type: _Kind
-
     @property
-    def refine(self) -> tuple[()]:
-        return ()
-
-    def to_port(self, n_water: float) -> NoPort:
-        return NoPort()
+    def refined(self) -> tuple[str, ...]:
+        return getattr(self, "refine", ())
 
 
-class UnknownPortEntry(NoPortEntry):
+def _entry(kind: type[Port]) -> type[PortEntry]:
+    """The keys of a kind of port: its numbers, its water and what may be refined."""
+    keys: dict[str, Any] = {
+        FILE_KEYS[name]: (_PORT_KEYS[name](kind), ...) for name in kind.numbers
+    }
+    if kind.refracts:
+        keys["water_index"] = (_Index | None, None)
+    if kind.refinable:
+        choices = tuple[Literal[kind.refinable], ...]  # type: ignore[name-defined]
+        keys["refine"] = (Annotated[choices, Field(strict=False)], ...)
+    entry = create_model(f"{kind.__name__}Entry", __base__=PortEntry, **keys)
+    entry.kind = kind
+    return entry
+
+
+class UnknownPortEntry(Entry):
     """Its type is what is wrong, whatever else is there."""
 
     model_config = ConfigDict(extra="ignore")
+
+    type: Literal[_WORDS]  # type: ignore[valid-type]
 
 
 def _port_tag(value: Any) -> str:
     if not isinstance(value, dict) or "type" not in value:
         return "(flat)"
-    return f"({value['type']})" if value["type"] in _PORT_KINDS else "(unknown)"
+    return f"({value['type']})" if value["type"] in _WORDS else "(unknown)"
 
 
-PortEntry = Annotated[
-    Annotated[FlatPortEntry, Tag("(flat)")]
-    | Annotated[DomePortEntry, Tag("(dome)")]
-    | Annotated[NoPortEntry, Tag("(none)")]
-    | Annotated[UnknownPortEntry, Tag("(unknown)")],
-    Discriminator(_port_tag),
+_PORT_ENTRIES = {f"({kind.word})": _entry(kind) for kind in KINDS}
+_TAGGED_PORTS = [
+    Annotated[entry, Tag(tag)]
+    for tag, entry in {**_PORT_ENTRIES, "(unknown)": UnknownPortEntry}.items()
 ]
+if TYPE_CHECKING:
+    _AnyPort = PortEntry
+else:
+    _AnyPort = Annotated[Union[tuple(_TAGGED_PORTS)], Discriminator(_port_tag)]  # noqa: UP007
 
 
 class ColmapLens(Entry):
@@ -342,7 +342,7 @@ class CameraEntry(Entry):
     name: Annotated[str, AfterValidator(checked_text)]
     images: Annotated[str, AfterValidator(checked_folder)]
     intrinsics: _TaggedLens
-    port: PortEntry
+    port: _AnyPort
     cam_from_rig: CamFromRig | None = None
     baseline_m: Annotated[_Number, AfterValidator(checked_baseline)] | None = None
     accuracy: CameraAccuracyEntry = CameraAccuracyEntry()
@@ -375,9 +375,7 @@ ENTRIES: dict[str, type[Entry]] = {
     "opencv": OpenCvBlock,
     "(radial_undistortion)": RadialUndistortionLens,
     "radial_undistortion": RadialUndistortionBlock,
-    "(flat)": FlatPortEntry,
-    "(dome)": DomePortEntry,
-    "(none)": NoPortEntry,
+    **_PORT_ENTRIES,
     "cam_from_rig": CamFromRig,
     "accuracy": CameraAccuracyEntry,
     "(rig accuracy)": RigAccuracyEntry,

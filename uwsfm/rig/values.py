@@ -43,9 +43,14 @@ def _checked_metres(value: float, noun: str, plural: str, limit: float) -> float
     return value
 
 
-def checked_port_distance(value: float) -> float:
-    """From the camera to the glass, metres."""
-    return _checked_metres(value, "port distance", "distances", 0.5)
+def checked_port_distance(value: float, limit: float) -> float:
+    """From the camera to the glass or the water, metres.
+
+    Args:
+        value: what is given.
+        limit: ``max_distance_m`` of the kind of port.
+    """
+    return _checked_metres(value, "port distance", "distances", limit)
 
 
 def checked_center(values: tuple[float, ...]) -> tuple[float, ...]:

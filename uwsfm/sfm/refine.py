@@ -1,5 +1,6 @@
 """From the perspective start to the refractive optimum."""
 
+import logging
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,10 +14,13 @@ from uwsfm.calibration.lengths import Lengths
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.scaling import scaled, start_scale
 from uwsfm.errors import UwsfmError
+from uwsfm.models.ports.dispatch import scalar_nouns
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.scene_points import agreeing_points, good_observations
 from uwsfm.sfm.second_start import better_start
+
+logger = logging.getLogger(__name__)
 
 # The start's ports are guesses: an error this large is a wrong match all the same.
 MAX_START_ERROR_PX = 50.0
@@ -84,6 +88,12 @@ def refine_scene(
     Raises:
         UwsfmError: nothing is left to adjust, or the result is not physical.
     """
+    for noun in scalar_nouns(scene.ports):
+        logger.info(
+            "%s: this kind of port has no vectorised kernels; the adjustment computes "
+            "its points one by one, which takes longer",
+            noun,
+        )
     given = lengths or Lengths()
     calibrated = within_valid_radius(scene, rig)
     calibrated[given.clicked] = True

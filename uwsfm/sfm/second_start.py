@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.errors import UwsfmError
-from uwsfm.models.ports.port import FlatPort, Port
+from uwsfm.models.ports.port import PlanePort, Port
 from uwsfm.scene import Scene
 
 FAR_FACTOR, FAR_M = 3.0, 0.02
@@ -73,7 +73,7 @@ def better_start(
 
 
 def _moved_far(before: Port, after: Port) -> bool:
-    if not (isinstance(before, FlatPort) and isinstance(after, FlatPort)):
+    if not (isinstance(before, PlanePort) and isinstance(after, PlanePort)):
         return False
     low, high = sorted((before.distance, after.distance))
     return high > FAR_FACTOR * low and high - low > FAR_M

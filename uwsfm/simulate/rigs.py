@@ -10,7 +10,7 @@ from uwsfm.calibration.given_accuracy import RigAccuracy
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, FlatPort, PlanePort, Port
 from uwsfm.rig.rig import Rig, RigCamera
 
 PAPER_TILTS_DEG = ((2.0, 40.0), (1.0, -10.0))
@@ -139,9 +139,9 @@ def rough_port(
     port: Port, *, straight: bool = True, distance_scale: float = 0.5
 ) -> Port:
     """A guess of a port: straight or concentric, at a share of its distance."""
-    if isinstance(port, FlatPort):
+    if isinstance(port, PlanePort):
         normal = (0.0, 0.0, 1.0) if straight else port.normal
-        return replace(port, normal=normal, distance=distance_scale * port.distance)
+        return port.changed(normal=normal, distance=distance_scale * port.distance)
     if isinstance(port, DomePort) and straight:
         return replace(port, center=(0.0, 0.0, 0.0))
     return port

@@ -17,7 +17,7 @@ from uwsfm._base.progress import Progress, silent
 from uwsfm.errors import InputError, UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.ports.port import KINDS, DomePort, Port
 from uwsfm.rig.file import dump_rig
 from uwsfm.rig.rig import Rig
 from uwsfm.simulate.footprints import footprints
@@ -40,11 +40,6 @@ COASTAL_WATER = WaterOptions(
 )
 RIG_HEADER = """Simulated stereo rig, as one would write it down before a dive:
 lenses and camera placement calibrated in air{}. The truth is in truth.json."""
-GUESSES = {
-    FlatPort: ", ports assumed straight and at half\ntheir true distance",
-    DomePort: ", domes assumed centred\non their cameras",
-}
-"""What `nominal_rig` makes of each kind of port, after the words before it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,10 +171,9 @@ def render_sequence(
 
 def rig_header(rig: Rig) -> str:
     """What is said on top of rig.yaml of the kinds of port that are there."""
-    kinds = {type(camera.port) for camera in rig.cameras}
-    return RIG_HEADER.format(
-        "".join(GUESSES[kind] for kind in GUESSES if kind in kinds)
-    )
+    made = {camera.port.guess for camera in rig.cameras}
+    guesses = dict.fromkeys(kind.guess for kind in KINDS)
+    return RIG_HEADER.format("".join(guess for guess in guesses if guess in made))
 
 
 def reseeded(spec: SequenceSpec, seed: int) -> SequenceSpec:
@@ -194,18 +188,8 @@ def frame_names(num_frames: int) -> list[str]:
 
 
 def _port_truth(port: Port) -> dict[str, Any]:
-    if isinstance(port, NoPort):
-        return {"port": "none"}
-    if isinstance(port, DomePort):
-        place = {"port": "dome", "center_m": port.center, "radius_m": port.radius}
-    else:
-        place = {"port": "flat", "normal": port.normal, "distance_m": port.distance}
-    return {
-        **place,
-        "thickness_m": port.thickness,
-        "glass_index": port.n_glass,
-        "water_index": port.n_water,
-    }
+    water = {"water_index": port.n_water} if port.refracts else {}
+    return {"port": port.word, **port.stated(), **water}
 
 
 def truth_of(spec: SequenceSpec) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import dir_from_img
+from uwsfm.models.lens_row import FX, FY
+from uwsfm.models.ports.row import DISTANCE, N_AIR, N_GLASS, N_WATER, THICKNESS
 from uwsfm.solver.layout import Layout
 from uwsfm.solver.state import State
 
@@ -46,14 +48,15 @@ def error_model(name: str, layout: Layout, state: State) -> ErrorModel:
         return ErrorModel(code, 1.0, np.empty((0, 3)))
     dirs = np.empty((len(layout.xy), 3))
     _dirs_from_img(layout.xy, layout.camera, state.lenses, dirs)
-    focal = np.sqrt(state.lenses[:, 0] * state.lenses[:, 1])
-    thick, n_air, n_glass, n_water = state.ports[:, 4:8].T
+    focal = np.sqrt(state.lenses[:, FX] * state.lenses[:, FY])
+    thick, n_air = state.ports[:, THICKNESS], state.ports[:, N_AIR]
+    n_glass, n_water = state.ports[:, N_GLASS], state.ports[:, N_WATER]
     if code == POINT_3D:
         centres = rigid3.inverse(state.rig_from_world)[:, 4:]
         reach = np.median(np.linalg.norm(state.points - centres.mean(axis=0), axis=1))
         return ErrorModel(code, float(np.mean(focal * n_water / n_air) / reach), dirs)
     # Paraxial focal length of the virtual camera, over its magnification n_w.
-    length = np.abs(state.ports[:, 3] + thick * n_air / n_glass)
+    length = np.abs(state.ports[:, DISTANCE] + thick * n_air / n_glass)
     if np.any(length == 0.0):
         camera = int(np.flatnonzero(length == 0.0)[0])
         raise InputError(

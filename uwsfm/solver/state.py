@@ -9,18 +9,18 @@ import numpy as np
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import NUM_PARAMS, with_limit
-from uwsfm.models.ports.port import DOME, KIND, port_from_row
+from uwsfm.models.ports.port import kind_of_row, port_from_row
+from uwsfm.models.ports.row import N_GLASS, N_WATER, PLACE, THICKNESS
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.solver.layout import HELD, Layout
 
 # Columns of a port's row that simply add, whatever its kind.
 PORT_COLUMNS = {
-    border.THICKNESS: 4,
-    border.GLASS_INDEX: 6,
-    border.WATER_INDEX: 7,
+    border.THICKNESS: THICKNESS,
+    border.GLASS_INDEX: N_GLASS,
+    border.WATER_INDEX: N_WATER,
 }
-RADIUS_OR_DISTANCE = 3
 
 
 class KernelState(NamedTuple):
@@ -119,7 +119,8 @@ class State:
         cam_from_rig, ports = self.cam_from_rig.copy(), self.ports.copy()
         for c, delta in enumerate(deltas):
             cam_from_rig[c] = _moved_camera(cam_from_rig[c], delta)
-            ports[c, :4] = _moved_interface(ports[c], delta)
+            step = np.append(delta[border.PLACE], delta[border.RADIUS])
+            ports[c, PLACE] = kind_of_row(ports[c]).plus(ports[c, PLACE], step)
         for slot, column in PORT_COLUMNS.items():
             ports[:, column] += deltas[:, slot]
         lenses = self.lenses
@@ -147,13 +148,11 @@ class State:
         for c, (port, other) in enumerate(
             zip(self.ports, reference.ports, strict=True)
         ):
-            beyond = port[RADIUS_OR_DISTANCE] - other[RADIUS_OR_DISTANCE]
-            if port[KIND] == DOME:
-                difference[c, border.CENTER] = port[:3] - other[:3]
-                difference[c, border.RADIUS] = beyond
-            else:
-                difference[c, border.NORMAL] = -unit_vector.minus(other[:3], port[:3])
-                difference[c, border.DISTANCE] = beyond
+            step = kind_of_row(port).minus(port[PLACE], other[PLACE])
+            difference[c, border.PLACE], difference[c, border.RADIUS] = (
+                step[:3],
+                step[3],
+            )
         for slot, column in PORT_COLUMNS.items():
             difference[:, slot] = self.ports[:, column] - reference.ports[:, column]
         difference[:, border.LENS] = (
@@ -176,14 +175,6 @@ def translation_arm(translation: Array) -> Array:
     direction = translation / length
     sideways = length * unit_vector.tangent_basis(direction).T
     return np.concatenate([sideways.ravel(), direction])
-
-
-def _moved_interface(port: Array, delta: Array) -> Array:
-    """First four numbers of a port: normal and distance, or centre and radius."""
-    if port[KIND] == DOME:
-        return port[:4] + np.append(delta[border.CENTER], delta[border.RADIUS])
-    normal = unit_vector.plus(port[:3], delta[border.NORMAL])
-    return np.append(normal, port[RADIUS_OR_DISTANCE] + delta[border.DISTANCE])
 
 
 def _moved_camera(cam_from_rig: Array, delta: Array) -> Array:

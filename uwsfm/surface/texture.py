@@ -16,6 +16,7 @@ from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.views import load_image
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import FOCAL
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.surface.atlas import Atlas
 from uwsfm.surface.mesh import Mesh
@@ -63,7 +64,7 @@ def texel_size(model: Model) -> float:
     """Side of a texel that holds what the images show, from near as well."""
     scene = model.scene
     depths = scene.points_in_cam()[:, 2]
-    focal = np.array([camera.lens[:2].mean() for camera in scene.cameras])
+    focal = np.array([camera.lens[FOCAL].mean() for camera in scene.cameras])
     pixel = float(np.nanmedian(depths / focal[scene.camera_idx]))
     return pixel / _TEXELS_PER_PIXEL
 

@@ -7,7 +7,7 @@ import numpy as np
 from uwsfm.calibration.bundle_adjustment import calibrate
 from uwsfm.calibration.problem import PRIORS
 from uwsfm.calibration.result import CalibrationResult
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 from uwsfm.scene import Scene
 
 STEP_M = 0.005
@@ -59,8 +59,8 @@ def pull_below_zero(calibration: CalibrationResult) -> float | None:
 
 def _with_distance(scene: Scene, at_zero: list[bool], distance: float) -> Scene:
     cameras = [
-        camera.with_port(replace(camera.port, distance=distance))
-        if held and isinstance(camera.port, FlatPort)
+        camera.with_port(camera.port.changed(distance=distance))
+        if held and isinstance(camera.port, PlanePort)
         else camera
         for camera, held in zip(scene.cameras, at_zero, strict=True)
     ]

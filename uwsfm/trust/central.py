@@ -7,8 +7,9 @@ import pycolmap
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.lens import NUM_PARAMS, param_slots
-from uwsfm.models.ports.port import FlatPort, NoPort, Port
+from uwsfm.models.lens import param_slots
+from uwsfm.models.lens_row import CENTER, DISTORTION, FOCAL
+from uwsfm.models.ports.port import NoPort, PlanePort, Port
 from uwsfm.models.refractive import RefractiveCamera
 
 _LEAST_MODEL = "OPENCV"
@@ -60,12 +61,12 @@ def fit_central(
     Returns:
         None: there is no port, or not enough to fit to.
     """
-    if isinstance(camera.port, NoPort):
+    if not camera.port.refracts:
         return None
     lens, model = camera.lens.copy(), camera.camera.model_name
-    if isinstance(camera.port, FlatPort):
-        lens[:2] *= camera.port.n_water
-        lens[4:NUM_PARAMS] = 0.0  # of other angles: what it is in water is fitted
+    if isinstance(camera.port, PlanePort):
+        lens[FOCAL] *= camera.port.n_water
+        lens[DISTORTION] = 0.0  # of other angles: what it is in water is fitted
         model = _LEAST_MODEL if model in _WITHOUT_ZERO else model
     base = _with_distortion(camera, lens, NoPort(), model)
     return _fitted(base, points_in_cam, xy)
@@ -94,10 +95,10 @@ def _fitted(
     scale = np.array([1.0, 1.0, 1.0, depth, depth, depth])
 
     def fit_at(unknowns: Array) -> FittedCamera:
-        row, lens = base.lens.copy(), unknowns[6:]
-        row[:2] *= np.exp(lens[:2])
-        row[2:4] += row[:2] * lens[2:4]
-        row[slots[4:]] += lens[4:]
+        row, unknown = base.lens.copy(), unknowns[6:]
+        row[FOCAL] *= np.exp(unknown[:2])
+        row[CENTER] += row[FOCAL] * unknown[2:4]
+        row[slots[4:]] += unknown[4:]
         pose = rigid3.perturb(rigid3.IDENTITY, scale * unknowns[:6])
         return FittedCamera(camera=base.with_lens(row), fitted_from_cam=pose)
 

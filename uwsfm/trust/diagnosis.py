@@ -18,7 +18,7 @@ from uwsfm._base.progress import Progress, silent
 from uwsfm.calibration.parameters import PRIORS, REFINABLE
 from uwsfm.calibration.problem import CalibrateOptions
 from uwsfm.calibration.result import CalibrationResult
-from uwsfm.models.ports.port import DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.sfm.rig_checks.lens_mistakes import OF_DISTORTION
@@ -232,7 +232,7 @@ def strain_of(rig: Rig, fit: Fit) -> float:
     """How far ports and placement are from the rig file's, beyond what is usual."""
     total = 0.0
     for item, port in zip(rig.cameras, fit.scene.ports, strict=True):
-        if isinstance(port, FlatPort) and isinstance(item.port, FlatPort):
+        if isinstance(port, PlanePort) and isinstance(item.port, PlanePort):
             if item.refine_distance:
                 total += _distance_strain(port.distance, item.port.distance)
             tilt = float(np.degrees(np.arccos(min(port.normal[2], 1.0))))

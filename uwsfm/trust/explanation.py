@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 from uwsfm.trust.mistakes import Trial
 from uwsfm.trust.trials import TRIMMED, Fit
 
@@ -192,7 +192,7 @@ def _port_evidence(base: Tried, one: Tried) -> list[str]:
     given = [
         item.port.distance
         for item in one.trial.rig.cameras
-        if isinstance(item.port, FlatPort)
+        if isinstance(item.port, PlanePort)
     ]
     if not before or base.strain < 1.0:
         return []

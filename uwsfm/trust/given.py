@@ -15,8 +15,9 @@ from uwsfm.calibration.parameters import OF_PORTS
 from uwsfm.calibration.priors import prior_stddevs
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.lens import BROWN, KIND, NUM_PARAMS, PINHOLE
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
+from uwsfm.models.lens import BROWN, KIND, PINHOLE
+from uwsfm.models.lens_row import CENTER, DISTORTION, FOCAL, FX
+from uwsfm.models.ports.port import DomePort, NoPort, PlanePort, Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.residuals import border
 from uwsfm.rig.rig import Rig, RigCamera
@@ -185,7 +186,7 @@ def _port(
     distance = options.distance_stddev_m or camera.accuracy.distance_m
     normal = options.normal_stddev_deg or camera.accuracy.normal_deg
     stated = options.center_stddev_m or camera.accuracy.center_m
-    if isinstance(before, FlatPort) and isinstance(after, FlatPort):
+    if isinstance(before, PlanePort) and isinstance(after, PlanePort):
         if metric and (refined[border.DISTANCE] or cov.distance_at_zero):
             smaller = min(before.distance, after.distance)
             assumed = max(DISTANCE_M, DISTANCE_SHARE * smaller)
@@ -271,7 +272,7 @@ def _lens(
     options, found = calibration.options, []
     cols = calibration.covariance.border_cols[index, border.FIRST_LENS :]
     stddevs = np.append(np.sqrt(np.diag(calibration.covariance.border)), 0.0)[cols]
-    bare = isinstance(camera.port, NoPort)
+    bare = not camera.port.refracts
     focal, point = options.focal_stddev, options.principal_point_stddev_px
     if cols[0] != HELD and not (bare and focal is None):
         found.append(
@@ -279,14 +280,14 @@ def _lens(
                 camera=camera.name,
                 what="focal_share",
                 given=1.0,
-                estimate=float(after.lens[0] / before.lens[0]),
-                stddev=float(stddevs[0] / before.lens[0]),
+                estimate=float(after.lens[FX] / before.lens[FX]),
+                stddev=float(stddevs[0] / before.lens[FX]),
                 given_stddev=focal or FOCAL_SHARE,
                 stated=focal is not None,
             )
         )
     if cols[2] != HELD and not (bare and point is None):
-        shift = after.lens[2:4] - before.lens[2:4]
+        shift = after.lens[CENTER] - before.lens[CENTER]
         found.append(
             Departure(
                 camera=camera.name,
@@ -298,7 +299,7 @@ def _lens(
                 stated=point is not None,
             )
         )
-    if np.any(cols[4:NUM_PARAMS] != HELD):
+    if np.any(cols[DISTORTION] != HELD):
         found += _distortion(camera, before, after)
     return found
 
@@ -312,7 +313,7 @@ def _distortion(
     for item in (before, after):
         rays = item.with_port(NoPort()).ray_from_img(edge)[1]
         seen = np.all(np.isfinite(rays), axis=1)
-        offset = (edge - item.lens[2:4]) / item.lens[:2]
+        offset = (edge - item.lens[CENTER]) / item.lens[FOCAL]
         ideal = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
         ratio = np.linalg.norm(offset, axis=1) / np.maximum(ideal, 1e-9)
         far = seen & (ideal > 1e-3)
@@ -356,6 +357,6 @@ def _edge(camera: RefractiveCamera, valid_radius_px: float | None) -> Array:
     edge = np.concatenate(sides) * [camera.width, camera.height]
     if valid_radius_px is None:
         return edge
-    offset = edge - camera.lens[2:4]
+    offset = edge - camera.lens[CENTER]
     radius = np.linalg.norm(offset, axis=1, keepdims=True)
-    return camera.lens[2:4] + offset * np.minimum(1.0, valid_radius_px / radius)
+    return camera.lens[CENTER] + offset * np.minimum(1.0, valid_radius_px / radius)

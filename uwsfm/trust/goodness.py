@@ -14,6 +14,7 @@ import numpy as np
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import CENTER
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.noise_floor import NoiseFloor
@@ -229,7 +230,7 @@ class _Left:
     def _by_depth(self) -> Systematic:
         """Along and across the radius, by depth and half of the radius: a port that is
         wrong draws near and far points to different radii."""
-        centers = np.array([camera.lens[2:4] for camera in self.scene.cameras])
+        centers = np.array([camera.lens[CENTER] for camera in self.scene.cameras])
         offset = self.scene.xy - centers[self.scene.camera_idx]
         radius = np.linalg.norm(offset, axis=1)
         outwards = offset / np.maximum(radius, 1e-9)[:, None]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwsfm.models.lens_row import CENTER, FX
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 from uwsfm.trust.mistakes import FOCAL, FREE, MIN_FRAMES_LEFT, Trial, shifts
@@ -43,12 +44,12 @@ class ZoomTrial(Trial):
         late = scene.frame_idx >= self.first
         factor = np.where(late, ratios[scene.camera_idx], 1.0)
         lenses = np.array([camera.lens for camera in self.rig.refractive_cameras()])
-        center = lenses[scene.camera_idx, 2:4]
+        center = lenses[scene.camera_idx, CENTER]
         xy = center + (scene.xy - center) / factor[:, None]
         fit = adjusted(replace(scene, xy=xy), self.rig, **free)
         if fit is None:
             return None
-        before = np.array([camera.lens[0] for camera in fit.scene.cameras])
+        before = np.array([camera.lens[FX] for camera in fit.scene.cameras])
         squares = fit.squares * factor**2  # of the pixels that were given
         return replace(fit, squares=squares, focals=(before, ratios * before))
 
@@ -59,7 +60,7 @@ class ZoomTrial(Trial):
             for rows in (~late, late)
         ]
         before, after = (
-            [] if part is None else [camera.lens[0] for camera in part.scene.cameras]
+            [] if part is None else [camera.lens[FX] for camera in part.scene.cameras]
             for part in parts
         )
         if not before or not after:

@@ -14,7 +14,7 @@ import numpy as np
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import PlanePort, Port
 from uwsfm.rig.rig import Rig, RigCamera
 from uwsfm.scene import Scene
 from uwsfm.sfm.correction import Correction, quoted, subsets
@@ -199,19 +199,14 @@ def _free_rotation(rig: Rig) -> Iterator[Trial]:
     )
 
 
-PORT_PARTS: tuple[tuple[type[Port], tuple[str, ...]], ...] = (
-    (FlatPort, ("distance",)),
-    (FlatPort, ("normal",)),
-    (FlatPort, ("distance", "normal")),
-    (DomePort, ("center",)),
-)
+PORT_PARTS = (("distance",), ("normal",), ("distance", "normal"), ("center",))
 """What a rig file may hold of a port, and what may be wrong at once."""
 
 
 def _free_ports(rig: Rig) -> Iterator[Trial]:
     """What the rig file holds of the ports, of all cameras and of each alone."""
-    for kind, parts in PORT_PARTS:
-        for which in subsets(rig, partial(_holds, kind=kind, parts=parts)):
+    for parts in PORT_PARTS:
+        for which in subsets(rig, partial(_holds, parts=parts)):
             flags: dict[str, Any] = {f"refine_{part}": True for part in parts}
             names, held = quoted(rig, which), " and ".join(parts)
             yield Trial(
@@ -233,9 +228,9 @@ def _free_ports(rig: Rig) -> Iterator[Trial]:
             )
 
 
-def _holds(item: RigCamera, kind: type[Port], parts: tuple[str, ...]) -> bool:
+def _holds(item: RigCamera, parts: tuple[str, ...]) -> bool:
     held = not any(getattr(item, f"refine_{part}") for part in parts)
-    return isinstance(item.port, kind) and held
+    return held and all(part in item.port.refinable for part in parts)
 
 
 def _port_words(
@@ -321,7 +316,7 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
         rig: As given.
         distances_m: (C,) where the flat ports of the rig came out.
     """
-    flat = [c.port for c in rig.cameras if isinstance(c.port, FlatPort)]
+    flat = [c.port for c in rig.cameras if isinstance(c.port, PlanePort)]
     if rig.cam_from_rig is None or len(rig.cameras) < 2 or not flat or not distances_m:
         return
     glass = float(np.mean([port.thickness / port.n_glass for port in flat]))
@@ -347,12 +342,15 @@ def length_trials(rig: Rig, distances_m: list[float]) -> Iterator[Trial]:
             rig=_with_port_length(rig, "distance", times),
             handicap=_rarity([times * p.distance for p in flat], MAX_DISTANCE_M),
         )
+        glass_m = [times * p.thickness for p in flat if p.has("thickness")]
+        if not glass_m:
+            continue
         yield Trial(
             code="length_unit",
             what=f"the glass is {times:.3g} times as thick as in the rig file",
             remedy="check the unit of thickness_m, which is metres",
             rig=_with_port_length(rig, "thickness", times),
-            handicap=_rarity([times * p.thickness for p in flat], MAX_THICKNESS_M),
+            handicap=_rarity(glass_m, MAX_THICKNESS_M),
         )
 
 
@@ -391,10 +389,10 @@ def _shorter(rig: Rig, factor: float) -> Rig:
 
 
 def _with_port_length(rig: Rig, name: str, times: float) -> Rig:
-    cameras = tuple(
-        replace(item, port=replace(item.port, **{name: times * value}))
-        if (value := getattr(item.port, name, None)) is not None
-        else item
-        for item in rig.cameras
-    )
-    return replace(rig, cameras=cameras)
+    def longer(port: Port) -> Port:
+        if not port.has(name):
+            return port
+        return port.changed(**{name: times * getattr(port, name)})
+
+    cameras = [replace(item, port=longer(item.port)) for item in rig.cameras]
+    return replace(rig, cameras=tuple(cameras))

@@ -17,7 +17,6 @@ from scipy.optimize import least_squares
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import NoPort
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
 
@@ -72,7 +71,7 @@ def projection_map(
         seen.append(np.broadcast_to(good, points.shape[:2]))
         places.append(np.broadcast_to(xy, (*points.shape[:2], 2)))
     # One central camera sees the same at every size of the scene.
-    sized = len(rig.cameras) > 1 or not isinstance(rig.cameras[0].port, NoPort)
+    sized = len(rig.cameras) > 1 or rig.cameras[0].port.refracts
     motion = _best_motion(second, in_rig, places, seen, with_scale and sized)
     px, mm = [], []
     for c in range(len(first.cameras)):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import NoPort
+from uwsfm.models.lens_row import CENTER
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.rig_checks.pinhole_fit import fit_virtual_pinhole
@@ -156,7 +156,7 @@ def _camera(
 def _least_central(
     camera: RefractiveCamera, depth: Array
 ) -> tuple[float, float] | None:
-    if isinstance(camera.port, NoPort):
+    if not camera.port.refracts:
         return None
     found = fit_virtual_pinhole(camera, np.percentile(depth, [10.0, 50.0, 90.0]))
     return found.rms_px, found.max_px
@@ -169,7 +169,7 @@ def _places(camera: RefractiveCamera, xy: Array, points_in_cam: Array) -> _Place
     columns, rows = np.maximum(1, np.round(across * size / size.max())).astype(int)
     place = np.clip((xy / size * [columns, rows]).astype(np.int64), 0, None)
     column, row = np.minimum(place, [columns - 1, rows - 1]).T
-    offset = xy - camera.lens[2:4]
+    offset = xy - camera.lens[CENTER]
     radius = np.linalg.norm(offset, axis=1)
     return _Places(
         cell=row * columns + column,

@@ -20,13 +20,12 @@ from uwsfm.calibration.parameters import (
     TILT,
     lens_parameter,
 )
-from uwsfm.calibration.problem import port_kind
 from uwsfm.calibration.result import CalibrationResult
 from uwsfm.calibration.uncertainty import border_covariance
 from uwsfm.geometry import rigid3, unit_vector
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.lens import param_slots
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, PlanePort, Port
 from uwsfm.residuals import border
 from uwsfm.scene import IndexArray
 from uwsfm.solver.layout import HELD
@@ -203,7 +202,7 @@ def _readings(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
     ports = [result.scene.ports[camera] for result in both]
-    flat = [port for port in ports if isinstance(port, FlatPort)]
+    flat = [port for port in ports if isinstance(port, PlanePort)]
     domes = [port for port in ports if isinstance(port, DomePort)]
     if len(flat) == 2:
         normals = np.array([port.normal for port in flat])
@@ -221,7 +220,7 @@ def _readings(
         yield _several(CENTER, "xyz", centers, 1e3 * np.eye(3))
     yield from _placement(both, camera)
     for parameter in OF_PORTS:
-        has = all(port_kind(port) in parameter.ports for port in ports)
+        has = all(parameter.of(port) for port in ports)
         if has and parameter is not DISTANCE:
             yield _of_port(parameter, ports)
     yield from _lens(both, camera)

@@ -21,7 +21,7 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import finite_rows
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
 from uwsfm.sfm.refine import rig_options
@@ -68,11 +68,11 @@ class Fit:
 
     def distances_m(self) -> list[float]:
         """Of the flat ports."""
-        return [p.distance for p in self.scene.ports if isinstance(p, FlatPort)]
+        return [p.distance for p in self.scene.ports if isinstance(p, PlanePort)]
 
     def tilts_deg(self) -> list[float]:
         """Of the flat ports, against the optical axis."""
-        normals = [p.normal for p in self.scene.ports if isinstance(p, FlatPort)]
+        normals = [p.normal for p in self.scene.ports if isinstance(p, PlanePort)]
         return [float(np.degrees(np.arccos(min(n[2], 1.0)))) for n in normals]
 
 

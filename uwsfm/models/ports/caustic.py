@@ -8,11 +8,11 @@ along the ray of a pixel. Both roots are closed forms.
 import numpy as np
 
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import FlatPort
+from uwsfm.models.ports.port import PlanePort
 
 
 def caustic_points(
-    origins: Array, directions: Array, port: FlatPort
+    origins: Array, directions: Array, port: PlanePort
 ) -> tuple[Array, Array]:
     """Both focal points of each water ray, in the camera frame.
 

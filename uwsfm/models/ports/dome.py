@@ -1,6 +1,6 @@
 """Kernels of the dome port: water rays from air rays, air rays from points, Jacobians.
 
-A port is one row, see `uwsfm.models.ports.port`. All points and rays are in the camera
+A port is one row, see `uwsfm.models.ports.row`. All points and rays are in the camera
 frame, in metres. Failure is a status and NaN. The sphere is taken as whole: where a
 real dome ends, its mount is in the image.
 """
@@ -10,6 +10,16 @@ import math
 from uwsfm._base.jit import inner, lane
 from uwsfm.geometry.dome import dome_port_gradient, solve_dome_port
 from uwsfm.geometry.refraction import refract
+from uwsfm.models.ports.row import (
+    CX,
+    CY,
+    CZ,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    RADIUS,
+    THICKNESS,
+)
 from uwsfm.models.status import (
     IN_AIR_GAP,
     IN_GLASS,
@@ -56,12 +66,12 @@ def dome_water_ray(dx, dy, dz, port):
         (status, origin on the outer surface (3), unit direction in water (3)).
     """
     nan = math.nan
-    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
+    cx, cy, cz, radius = port[CX], port[CY], port[CZ], port[RADIUS]
     if not cx * cx + cy * cy + cz * cz < radius * radius:
         return MISSES_PORT, nan, nan, nan, nan, nan, nan
-    mu_g, mu_w = port[5] / port[6], port[6] / port[7]
+    mu_g, mu_w = port[N_AIR] / port[N_GLASS], port[N_GLASS] / port[N_WATER]
     ox, oy, oz, wx, wy, wz = bent_by_dome(
-        dx, dy, dz, cx, cy, cz, radius, radius + port[4], mu_g, mu_w
+        dx, dy, dz, cx, cy, cz, radius, radius + port[THICKNESS], mu_g, mu_w
     )
     if not abs(wx) < math.inf:
         return TOTAL_REFLECTION, nan, nan, nan, nan, nan, nan
@@ -84,8 +94,8 @@ def invariants(x, y, z, cx, cy, cz):
 def dome_air_ray(x, y, z, port):
     """Ray in air v = X - kappa c, not unit, of a point: (status, kappa, v (3))."""
     nan = math.nan
-    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
-    outer = radius + port[4]
+    cx, cy, cz, radius = port[CX], port[CY], port[CZ], port[RADIUS]
+    outer = radius + port[THICKNESS]
     a, b, c, q = invariants(x, y, z, cx, cy, cz)
     rho2 = a - 2.0 * b + c
     if not rho2 > outer * outer:
@@ -94,7 +104,14 @@ def dome_air_ray(x, y, z, port):
     if not c < radius * radius:
         return MISSES_PORT, nan, nan, nan, nan
     kappa = solve_dome_port(
-        a, b, c, q, radius, port[4], port[5] / port[6], port[5] / port[7]
+        a,
+        b,
+        c,
+        q,
+        radius,
+        port[THICKNESS],
+        port[N_AIR] / port[N_GLASS],
+        port[N_AIR] / port[N_WATER],
     )
     if not abs(kappa) < math.inf:
         return TOTAL_REFLECTION, nan, nan, nan, nan
@@ -139,8 +156,14 @@ def dome_jac(x, y, z, kappa, port, lens_rows, jac):
         lens_rows: the six numbers of L, row by row.
         jac: (2, JAC_SIZE), written.
     """
-    cx, cy, cz, radius, thick = port[0], port[1], port[2], port[3], port[4]
-    n_air, n_glass, n_water = port[5], port[6], port[7]
+    cx, cy, cz, radius, thick = (
+        port[CX],
+        port[CY],
+        port[CZ],
+        port[RADIUS],
+        port[THICKNESS],
+    )
+    n_air, n_glass, n_water = port[N_AIR], port[N_GLASS], port[N_WATER]
     mu_g, mu_w = n_air / n_glass, n_air / n_water
     a, b, c, q = invariants(x, y, z, cx, cy, cz)
     gradient = dome_port_gradient(kappa, a, b, c, q, radius, thick, mu_g, mu_w)

@@ -21,7 +21,25 @@ from uwsfm.models.lanes import (
     Z,
     store_ray,
 )
-from uwsfm.models.ports.dome import bent_by_dome, dome_jac_row, invariants
+from uwsfm.models.ports.dome import (
+    bent_by_dome,
+    dome_air_ray,
+    dome_jac,
+    dome_jac_row,
+    dome_water_ray,
+    invariants,
+)
+from uwsfm.models.ports.kernels import PortKernels
+from uwsfm.models.ports.row import (
+    CX,
+    CY,
+    CZ,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    RADIUS,
+    THICKNESS,
+)
 
 # Newton steps are quadratic: after one of 1e-9 of the ray the next is below rounding.
 LAST_STEP2 = 1e-18
@@ -30,9 +48,9 @@ LAST_STEP2 = 1e-18
 @inner
 def dome_air_lanes(port, buffer):
     """Rays in air of the points: ROOT, VX, VY, VZ and OK from X, Y, Z."""
-    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
-    outer = radius + port[4]
-    mu_g, mu_w = port[5] / port[6], port[5] / port[7]
+    cx, cy, cz, radius = port[CX], port[CY], port[CZ], port[RADIUS]
+    outer = radius + port[THICKNESS]
+    mu_g, mu_w = port[N_AIR] / port[N_GLASS], port[N_AIR] / port[N_WATER]
     inside = radius * radius - (cx * cx + cy * cy + cz * cz)
     for i in range(BLOCK):
         x, y, z = buffer[X * STRIDE + i], buffer[Y * STRIDE + i], buffer[Z * STRIDE + i]
@@ -71,9 +89,15 @@ def _write(buffer, row, i, values, by_glass, by_water):
 @inner
 def dome_jac_lanes(port, buffer):
     """Jacobians of the pixels by point and port from ROOT and d(pixel) / dv."""
-    cx, cy, cz, radius, thick = port[0], port[1], port[2], port[3], port[4]
-    mu_g, mu_w = port[5] / port[6], port[5] / port[7]
-    by_glass, by_water = -mu_g / port[6], -mu_w / port[7]
+    cx, cy, cz, radius, thick = (
+        port[CX],
+        port[CY],
+        port[CZ],
+        port[RADIUS],
+        port[THICKNESS],
+    )
+    mu_g, mu_w = port[N_AIR] / port[N_GLASS], port[N_AIR] / port[N_WATER]
+    by_glass, by_water = -mu_g / port[N_GLASS], -mu_w / port[N_WATER]
     for i in range(BLOCK):
         x, y, z = buffer[X * STRIDE + i], buffer[Y * STRIDE + i], buffer[Z * STRIDE + i]
         kappa = buffer[ROOT * STRIDE + i]
@@ -92,11 +116,25 @@ def dome_jac_lanes(port, buffer):
 @inner
 def dome_ray_lanes(port, buffer):
     """Water rays of the directions in air VX, VY, VZ, see `lanes.store_ray`."""
-    cx, cy, cz, radius = port[0], port[1], port[2], port[3]
-    mu_g, mu_w, outer = port[5] / port[6], port[6] / port[7], radius + port[4]
+    cx, cy, cz, radius = port[CX], port[CY], port[CZ], port[RADIUS]
+    mu_g, mu_w, outer = (
+        port[N_AIR] / port[N_GLASS],
+        port[N_GLASS] / port[N_WATER],
+        radius + port[THICKNESS],
+    )
     meets = radius * radius - (cx * cx + cy * cy + cz * cz)
     for i in range(BLOCK):
         dx, dy = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
         dz = buffer[VZ * STRIDE + i]
         ray = bent_by_dome(dx, dy, dz, cx, cy, cz, radius, outer, mu_g, mu_w)
         store_ray(i, ray, meets, buffer)
+
+
+KERNELS = PortKernels(
+    dome_water_ray,
+    dome_air_ray,
+    dome_jac,
+    dome_air_lanes,
+    dome_jac_lanes,
+    dome_ray_lanes,
+)

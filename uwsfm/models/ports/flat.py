@@ -1,6 +1,6 @@
 """Kernels of the flat port: water rays from air rays, air rays from points, Jacobians.
 
-A port is one row, see `uwsfm.models.ports.port`. All points and rays are in the camera
+A port is one row, see `uwsfm.models.ports.row`. All points and rays are in the camera
 frame, in metres. Failure is a status and NaN.
 """
 
@@ -9,6 +9,16 @@ import math
 from uwsfm._base.jit import inner, lane
 from uwsfm.geometry.refraction import refract, slope, solve_flat_port
 from uwsfm.geometry.unit_vector import tangents
+from uwsfm.models.ports.row import (
+    DISTANCE,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    NX,
+    NY,
+    NZ,
+    THICKNESS,
+)
 from uwsfm.models.status import (
     BEHIND_CAMERA,
     IN_AIR_GAP,
@@ -46,16 +56,16 @@ def flat_water_ray(dx, dy, dz, port):
     """
     nan = math.nan
     nx, ny, nz, mu_g, mu_w = (
-        port[0],
-        port[1],
-        port[2],
-        port[5] / port[6],
-        port[6] / port[7],
+        port[NX],
+        port[NY],
+        port[NZ],
+        port[N_AIR] / port[N_GLASS],
+        port[N_GLASS] / port[N_WATER],
     )
     if not nx * dx + ny * dy + nz * dz > 0.0:
         return MISSES_PORT, nan, nan, nan, nan, nan, nan
     ox, oy, oz, wx, wy, wz = bent_by_flat(
-        dx, dy, dz, nx, ny, nz, port[3], port[4], mu_g, mu_w
+        dx, dy, dz, nx, ny, nz, port[DISTANCE], port[THICKNESS], mu_g, mu_w
     )
     if not abs(wx) < math.inf:
         return TOTAL_REFLECTION, nan, nan, nan, nan, nan, nan
@@ -66,18 +76,23 @@ def flat_water_ray(dx, dy, dz, port):
 def flat_air_ray(x, y, z, port):
     """Ray in air v = n + q r of a finite point: (status, q, v (3)), v not unit."""
     nan = math.nan
-    nx, ny, nz = port[0], port[1], port[2]
+    nx, ny, nz = port[NX], port[NY], port[NZ]
     depth = nx * x + ny * y + nz * z
     if not depth > 0.0:
         return BEHIND_CAMERA, nan, nan, nan, nan
-    height = depth - port[3] - port[4]
+    height = depth - port[DISTANCE] - port[THICKNESS]
     if not height > 0.0:
-        status = IN_AIR_GAP if depth < port[3] else IN_GLASS
+        status = IN_AIR_GAP if depth < port[DISTANCE] else IN_GLASS
         return status, nan, nan, nan, nan
     rx, ry, rz = x - depth * nx, y - depth * ny, z - depth * nz
     r2 = rx * rx + ry * ry + rz * rz
     q = solve_flat_port(
-        height, r2, port[3], port[4], port[6] / port[5], port[7] / port[5]
+        height,
+        r2,
+        port[DISTANCE],
+        port[THICKNESS],
+        port[N_GLASS] / port[N_AIR],
+        port[N_WATER] / port[N_AIR],
     )
     if not q < math.inf:
         return TOTAL_REFLECTION, nan, nan, nan, nan
@@ -153,13 +168,20 @@ def flat_jac(x, y, z, q, port, lens_rows, jac):
         lens_rows: the six numbers of L, row by row.
         jac: (2, JAC_SIZE), written.
     """
-    nx, ny, nz = port[0], port[1], port[2]
-    n_air = port[5]
+    nx, ny, nz = port[NX], port[NY], port[NZ]
+    n_air = port[N_AIR]
     depth = nx * x + ny * y + nz * z
     rx, ry, rz = x - depth * nx, y - depth * ny, z - depth * nz
     r2 = rx * rx + ry * ry + rz * rz
     gradient = flat_gradient(
-        q, r2, depth, port[3], port[4], port[6] / n_air, port[7] / n_air, n_air
+        q,
+        r2,
+        depth,
+        port[DISTANCE],
+        port[THICKNESS],
+        port[N_GLASS] / n_air,
+        port[N_WATER] / n_air,
+        n_air,
     )
     basis = tangents(nx, ny, nz)
     for i in range(2):

@@ -20,7 +20,25 @@ from uwsfm.models.lanes import (
     Z,
     store_ray,
 )
-from uwsfm.models.ports.flat import bent_by_flat, flat_gradient, flat_jac_row
+from uwsfm.models.ports.flat import (
+    bent_by_flat,
+    flat_air_ray,
+    flat_gradient,
+    flat_jac,
+    flat_jac_row,
+    flat_water_ray,
+)
+from uwsfm.models.ports.kernels import PortKernels
+from uwsfm.models.ports.row import (
+    DISTANCE,
+    N_AIR,
+    N_GLASS,
+    N_WATER,
+    NX,
+    NY,
+    NZ,
+    THICKNESS,
+)
 
 # Halley steps are cubic: F of 1e-6 before the last one is below rounding after it.
 LAST_STEP_FROM = 1e-6
@@ -29,8 +47,14 @@ LAST_STEP_FROM = 1e-6
 @inner
 def flat_air_lanes(port, buffer):
     """Rays in air of the points: ROOT, VX, VY, VZ and OK from X, Y, Z."""
-    nx, ny, nz, dist, thick = port[0], port[1], port[2], port[3], port[4]
-    g, w = port[6] / port[5], port[7] / port[5]
+    nx, ny, nz, dist, thick = (
+        port[NX],
+        port[NY],
+        port[NZ],
+        port[DISTANCE],
+        port[THICKNESS],
+    )
+    g, w = port[N_GLASS] / port[N_AIR], port[N_WATER] / port[N_AIR]
     g2, w2, inv_g, inv_w = g * g, w * w, 1.0 / g, 1.0 / w
     # Other orders of the indices need brackets: all lanes go to the scalar kernel.
     tolerance = LAST_STEP_FROM if g >= 1.0 and w >= 1.0 else -1.0
@@ -63,14 +87,14 @@ def _write(buffer, row, i, values):
 def flat_jac_lanes(port, buffer):
     """Jacobians of the pixels by point and port from ROOT and d(pixel) / dv."""
     nx, ny, nz, dist, thick, n_air = (
-        port[0],
-        port[1],
-        port[2],
-        port[3],
-        port[4],
-        port[5],
+        port[NX],
+        port[NY],
+        port[NZ],
+        port[DISTANCE],
+        port[THICKNESS],
+        port[N_AIR],
     )
-    g, w = port[6] / n_air, port[7] / n_air
+    g, w = port[N_GLASS] / n_air, port[N_WATER] / n_air
     normal, basis = (nx, ny, nz), tangents(nx, ny, nz)
     for i in range(BLOCK):
         x, y, z = buffer[X * STRIDE + i], buffer[Y * STRIDE + i], buffer[Z * STRIDE + i]
@@ -94,11 +118,27 @@ def flat_jac_lanes(port, buffer):
 @inner
 def flat_ray_lanes(port, buffer):
     """Water rays of the directions in air VX, VY, VZ, see `lanes.store_ray`."""
-    nx, ny, nz, dist, thick = port[0], port[1], port[2], port[3], port[4]
-    mu_g, mu_w = port[5] / port[6], port[6] / port[7]
+    nx, ny, nz, dist, thick = (
+        port[NX],
+        port[NY],
+        port[NZ],
+        port[DISTANCE],
+        port[THICKNESS],
+    )
+    mu_g, mu_w = port[N_AIR] / port[N_GLASS], port[N_GLASS] / port[N_WATER]
     for i in range(BLOCK):
         dx, dy = buffer[VX * STRIDE + i], buffer[VY * STRIDE + i]
         dz = buffer[VZ * STRIDE + i]
         meets = nx * dx + ny * dy + nz * dz
         ray = bent_by_flat(dx, dy, dz, nx, ny, nz, dist, thick, mu_g, mu_w)
         store_ray(i, ray, meets, buffer)
+
+
+KERNELS = PortKernels(
+    flat_water_ray,
+    flat_air_ray,
+    flat_jac,
+    flat_air_lanes,
+    flat_jac_lanes,
+    flat_ray_lanes,
+)

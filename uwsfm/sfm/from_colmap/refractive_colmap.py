@@ -11,7 +11,7 @@ in air, keypoints the raw ones and poses those of the real cameras: as here.
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -23,17 +23,15 @@ from uwsfm.colmap.model import read_reconstruction
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
-from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
+from uwsfm.models.ports.kind import eight
+from uwsfm.models.ports.port import KINDS, NoPort, Port
+from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap, refine_flags
 from uwsfm.sfm.rig_checks.baseline import MAX_FRAMES, robust_average
 
 CAMERAS, IMAGES, POINTS = "cameras.txt", "images.txt", "points3D.txt"
 MAX_BYTES = 50_000_000
 """Of ``cameras.txt``: a camera for each of half a million images."""
-_PORTS: dict[str, type[FlatPort] | type[DomePort]] = {
-    "FLATPORT": FlatPort,
-    "DOMEPORT": DomePort,
-}
+_NAMES = tuple(dict.fromkeys(k.colmap_name for k in KINDS if k.colmap_name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +50,9 @@ def camera_line(camera_id: int, entry: PortCamera) -> str:
     items = [camera_id, camera.model_name, camera.width, camera.height]
     # repr: the shortest decimal number that reads back to the same double.
     items += [repr(float(value)) for value in camera.params]
-    if not isinstance(entry.port, NoPort):
-        kind = next(name for name, cls in _PORTS.items() if isinstance(entry.port, cls))
-        items += [kind, *(repr(float(value)) for value in entry.port.params)]
+    if entry.port.colmap_name is not None:
+        items.append(entry.port.colmap_name)
+        items += [repr(float(value)) for value in entry.port.params]
     return " ".join(str(item) for item in items) + "\n"
 
 
@@ -111,11 +109,19 @@ def _parsed(items: list[str]) -> tuple[int, PortCamera]:
     if split is None:
         return camera_id, PortCamera(camera=camera, port=NoPort())
     kind = items[split]
-    if kind not in _PORTS:
-        known = " and ".join(_PORTS)
+    if kind not in _NAMES:
+        known = " and ".join(_NAMES)
         raise InputError(f"unknown port model {kind!r}; the known ones are {known}")
     row = [_number(item) for item in items[split + 1 :]]
-    return camera_id, PortCamera(camera=camera, port=_PORTS[kind].from_params(row))
+    return camera_id, PortCamera(camera=camera, port=_port(kind, row))
+
+
+def _port(name: str, row: list[float]) -> Port:
+    """The port of a name of Refractive COLMAP, which several kinds may share: the kind
+    with the fewest numbers of its own that its parameters fit."""
+    numbers = np.array(eight(name, row))
+    kinds = [k for k in KINDS if k.colmap_name == name and k.reads(numbers)]
+    return min(kinds, key=lambda kind: len(kind.numbers)).from_params(numbers)
 
 
 def _integer(text: str) -> int:
@@ -200,7 +206,7 @@ def rig_of_refractive_colmap(path: str | Path) -> Rig:
 def ports_missing(rig: Rig) -> str:
     """What to do about cameras that a model has no port of, a sentence; "": there are
     none. Stock COLMAP's have none, and lenses that make up for refraction."""
-    bare = [c.name for c in rig.cameras if isinstance(c.port, NoPort)]
+    bare = [c.name for c in rig.cameras if not c.port.refracts]
     if not bare:
         return ""
     return (
@@ -213,21 +219,14 @@ def ports_missing(rig: Rig) -> str:
 
 def _rig_camera(entry: PortCamera, folder: str) -> RigCamera:
     port = entry.port
-    if not isinstance(port, NoPort):
-        port = replace(
-            port,
-            n_air=1.0,
-            n_glass=port.n_glass / port.n_air,
-            n_water=port.n_water / port.n_air,
-        )
+    if port.refracts:
+        port = port.in_air()
     return RigCamera(
         name=folder.replace("/", "-"),
         images=folder,
         camera=entry.camera,
         port=port,
-        refine_normal=isinstance(port, FlatPort),
-        refine_distance=isinstance(port, FlatPort),
-        refine_center=isinstance(port, DomePort),
+        **refine_flags(port.refinable),
     )
 
 

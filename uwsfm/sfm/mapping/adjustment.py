@@ -9,7 +9,8 @@ import numpy as np
 from uwsfm._base.indices import renumbered
 from uwsfm.calibration.priors import border_priors
 from uwsfm.calibration.problem import CalibrateOptions
-from uwsfm.models.ports.port import FLAT, KIND, DomePort, FlatPort
+from uwsfm.models.ports.port import DomePort, PlanePort, behind_camera
+from uwsfm.models.ports.row import DISTANCE
 from uwsfm.residuals.border import BORDER_SIZE
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray, Scene
@@ -52,7 +53,7 @@ class Housings:
         the place of a single camera's port, which scales with everything else.
         """
         ports = [camera.port for camera in rig.cameras]
-        distances = [port.distance for port in ports if isinstance(port, FlatPort)]
+        distances = [port.distance for port in ports if isinstance(port, PlanePort)]
         radii = [port.radius for port in ports if isinstance(port, DomePort)]
         distance = float(np.mean(distances)) if distances else 0.0
         single = {"refine_distances": False, "refine_centers": False}
@@ -139,12 +140,12 @@ def _minimized(
             priors = border_priors(housings.known, housings.settings, columns, 1.0)
         layout = build_layout(scene, columns, held_frames)
         state = minimize(layout, start, options, priors).state
-        negative = (state.ports[:, KIND] == FLAT) & (state.ports[:, 3] < 0.0)
+        negative = behind_camera(state.ports)
         if housings is None or not np.any(negative):
             return state
         at_zero |= negative
         ports = state.ports.copy()
-        ports[at_zero, 3] = 0.0
+        ports[at_zero, DISTANCE] = 0.0
         start = replace(state, ports=ports)
 
 

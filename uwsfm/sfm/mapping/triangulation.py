@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from uwsfm._base.jit import inner, kernel
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.vec3 import add, cross, dot
+from uwsfm.models.lens_row import FX
+from uwsfm.models.ports.row import N_WATER
 from uwsfm.models.projection import JAC_SIZE, project_with_jac
 from uwsfm.models.status import VALID
 from uwsfm.residuals.reprojection import point_in_rig, residual
@@ -135,7 +137,7 @@ def match_gaps_batch(views, ends, gaps):
             gap = _gap(views, a, b, x, y, z, jac)
         if cosine > 0.0:
             c = views.camera[views.image[a]]
-            focal = views.lenses[c, 0] * views.ports[c, 7]
+            focal = views.lenses[c, FX] * views.ports[c, N_WATER]
             turn = focal * math.sqrt(max(1.0 - cosine * cosine, 0.0))
             gap = min(gap, turn)
         gaps[k] = gap if gap >= 0.0 else math.inf

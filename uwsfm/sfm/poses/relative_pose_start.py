@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
+from uwsfm.models.lens_row import FOCAL
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.sfm.poses.kernel_rows import IndexArray
 from uwsfm.sfm.poses.relative_pose_options import RelativePoseOptions
@@ -157,7 +158,7 @@ def ransac_options(
     options: RelativePoseOptions, pair: tuple[RefractiveCamera, RefractiveCamera]
 ) -> pycolmap.RANSACOptions:
     """For directions in the water, whose pixels are smaller than in air."""
-    focals = [camera.port.n_water * np.mean(camera.lens[:2]) for camera in pair]
+    focals = [camera.port.n_water * np.mean(camera.lens[FOCAL]) for camera in pair]
     return pycolmap.RANSACOptions(
         max_error=options.max_central_error_px / float(np.mean(focals)),
         confidence=options.confidence,

@@ -16,7 +16,7 @@ import numpy as np
 
 from uwsfm.errors import InputError
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import NoPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.rig.rig import Rig, RigCamera, camera_from_colmap
 from uwsfm.sfm.correction import Correction, quoted, subsets
 
@@ -252,7 +252,7 @@ def focal_corrections(rig: Rig, which: Sequence[int]) -> Iterator[Correction]:
 def _is_of_water(port: Port, factor: float) -> bool:
     """Whether a focal length by ``factor`` is that of the lens in air, from one that
     was calibrated in the water."""
-    if isinstance(port, NoPort):
+    if not port.refracts:
         return False
     return abs(factor * port.n_water - 1.0) <= SAME_INDEX
 

@@ -20,7 +20,8 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.geometry.unit_vector import angle_between
-from uwsfm.models.ports.port import FLAT, KIND, DomePort, FlatPort, Port
+from uwsfm.models.ports.port import DomePort, PlanePort, Port, behind_camera
+from uwsfm.models.ports.row import DISTANCE
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import Scene
@@ -39,7 +40,8 @@ FREEDOM = {
 }
 """How far ports are from what a person writes down, about."""
 MAX_TILT_DEG = 15.0
-MAX_DISTANCE_M = 0.25
+MAX_DISTANCE_SHARE = 0.5
+"""Of what its kind may have: a quarter of a metre, of a flat port."""
 MAX_BEHIND_M = 0.01
 """A distance may come out below zero, its bound, by what noise does to it."""
 MAX_MISFIT = 1e-3
@@ -141,10 +143,10 @@ def _moved(scene: Scene, given: Scene, pair: PairMatches) -> MovedPorts | None:
         border_priors(given, settings, columns, 1.0),
     ).state
     ports = state.ports.copy()
-    behind = (ports[:, KIND] == FLAT) & (ports[:, 3] < 0.0)
-    if np.any(ports[behind, 3] < -MAX_BEHIND_M):
+    behind = behind_camera(ports)
+    if np.any(ports[behind, DISTANCE] < -MAX_BEHIND_M):
         return None
-    ports[behind, 3] = 0.0
+    ports[behind, DISTANCE] = 0.0
     try:
         found = replace(state, ports=ports).to_scene(scene)
     except InputError:  # a dome in front of its lens, a normal that points inwards
@@ -169,7 +171,7 @@ def _moved(scene: Scene, given: Scene, pair: PairMatches) -> MovedPorts | None:
 
 def _moves(before: Port, after: Port) -> float:
     """How far one port moved, in standard deviations of `FREEDOM`."""
-    if isinstance(before, FlatPort) and isinstance(after, FlatPort):
+    if isinstance(before, PlanePort) and isinstance(after, PlanePort):
         tilt = np.degrees(angle_between(before.normal, after.normal))
         along = after.distance - before.distance
         return math.hypot(
@@ -187,9 +189,10 @@ def _step(pair: PairMatches) -> int:
 
 
 def _possible(port: object) -> bool:
-    if isinstance(port, FlatPort):
+    if isinstance(port, PlanePort):
         tilt = np.degrees(np.arccos(np.clip(port.normal[2], -1.0, 1.0)))
-        return bool(tilt <= MAX_TILT_DEG and 0.0 <= port.distance <= MAX_DISTANCE_M)
+        most = MAX_DISTANCE_SHARE * port.max_distance_m
+        return bool(tilt <= MAX_TILT_DEG and 0.0 <= port.distance <= most)
     if isinstance(port, DomePort):
         return float(np.linalg.norm(port.center)) < port.radius
     return True
@@ -231,11 +234,11 @@ def _tilted(
 
 
 def _leaning(port: Port, by: Array) -> Port:
-    if not isinstance(port, FlatPort):
+    if not isinstance(port, PlanePort):
         return port
     x, y, z = (np.asarray(port.normal) + by).tolist()
     length = math.sqrt(x * x + y * y + z * z)
-    return replace(port, normal=(x / length, y / length, z / length))
+    return port.changed(normal=(x / length, y / length, z / length))
 
 
 def _one_frame(

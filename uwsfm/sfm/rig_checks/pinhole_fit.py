@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 
 from uwsfm.geometry.rays import triangulate_tracks
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import FlatPort
 from uwsfm.models.refractive import RefractiveCamera
 
 GRID_STEPS = 24
@@ -90,8 +89,7 @@ def fit_virtual_pinhole(
     xy, origins, dirs = xy[within], origins[within], dirs[within]
     center = triangulate_tracks(origins, dirs, np.zeros(len(xy), dtype=np.int64), 1)[0]
     near, depth, far = (np.inf,) * 3 if depths is None else np.asarray(depths, float)
-    # A dome around the camera magnifies nothing.
-    magnification = camera.port.n_water if isinstance(camera.port, FlatPort) else 1.0
+    magnification = camera.port.n_water if camera.port.magnifies else 1.0
     focal = float(magnification * np.mean(_focal_lengths(camera)))
     image = focal * _tangents(camera, xy, center, depth)
     low, high = np.nanmin(image, axis=0), np.nanmax(image, axis=0)

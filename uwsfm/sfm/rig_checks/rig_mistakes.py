@@ -17,7 +17,7 @@ from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
 from uwsfm.models.ports.port import DomePort, FlatPort, NoPort, Port
 from uwsfm.rig.file import FRESH_WATER
-from uwsfm.rig.rig import Rig
+from uwsfm.rig.rig import Rig, refine_flags
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.correction import Correction, quoted, subsets
 from uwsfm.sfm.rig_checks.lens_mistakes import (
@@ -51,19 +51,18 @@ def _with_ports(
         cameras[c] = replace(
             cameras[c],
             port=port,
-            refine_normal=isinstance(port, FlatPort)
-            and (free or cameras[c].refine_normal),
-            refine_distance=isinstance(port, FlatPort)
-            and (free or cameras[c].refine_distance),
-            refine_center=isinstance(port, DomePort)
-            and (free or cameras[c].refine_center),
+            **refine_flags(
+                name
+                for name in port.refinable
+                if free or getattr(cameras[c], f"refine_{name}")
+            ),
         )
     return replace(rig, cameras=tuple(cameras))
 
 
 def port_corrections(rig: Rig) -> Iterator[Correction]:
     """The port itself: none, missing, of the other kind, in another water."""
-    for which in subsets(rig, lambda c: not isinstance(c.port, NoPort)):
+    for which in subsets(rig, lambda c: c.port.refracts):
         yield _in_water(rig, which, _with_ports(rig, which, lambda _: NoPort()))
     yield from missing_ports(rig)
     yield from _other_kinds(rig)
@@ -89,7 +88,7 @@ def lenses_in_water(rig: Rig) -> Iterator[Correction]:
     Closer than no port at all, where the distortion is that of the lens in air.
     """
     for c, item in enumerate(rig.cameras):
-        if isinstance(item.port, NoPort):
+        if not item.port.refracts:
             continue
         factor = 1.0 / item.port.n_water
         other = changed_lenses(rig, (c,), partial(with_focal, factor=factor))
@@ -104,7 +103,7 @@ def missing_ports(rig: Rig) -> Iterator[Correction]:
 
     Any flat port will do for it: what it does to rays is mostly the water's.
     """
-    for which in subsets(rig, lambda c: isinstance(c.port, NoPort))[:1]:
+    for which in subsets(rig, lambda c: not c.port.refracts)[:1]:
         names = quoted(rig, which)
         yield Correction(
             code="port_missing",
@@ -153,9 +152,7 @@ def _as_flat(port: Port) -> Port:
 
 
 def _other_waters(rig: Rig) -> Iterator[Correction]:
-    behind = tuple(
-        c for c, item in enumerate(rig.cameras) if not isinstance(item.port, NoPort)
-    )
+    behind = tuple(c for c, item in enumerate(rig.cameras) if item.port.refracts)
     if not behind:
         return
     given = rig.cameras[behind[0]].port.n_water
@@ -165,8 +162,7 @@ def _other_waters(rig: Rig) -> Iterator[Correction]:
         medium = "air" if index == 1.0 else "water"
 
         def filled(port: Port, index: float = index) -> Port:
-            assert not isinstance(port, NoPort)
-            return replace(port, n_water=index)
+            return port.changed(n_water=index)
 
         yield Correction(
             code="water_index",

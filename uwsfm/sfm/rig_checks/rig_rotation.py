@@ -15,7 +15,7 @@ import numpy as np
 from uwsfm.errors import InputError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DomePort, FlatPort, Port
+from uwsfm.models.ports.port import Port
 from uwsfm.models.refractive import RefractiveCamera
 from uwsfm.rig.rig import Rig
 from uwsfm.sfm.poses.epipolar import ray_pairs, relative_pose
@@ -65,13 +65,13 @@ class RigRotation:
 def _cause(port: Port, turn_deg: float, mistake: str) -> str:
     """The mistake that explains a turn, if any, then what else turns the rays."""
     words = [f"probably {mistake}; else"] if mistake else []
-    if isinstance(port, DomePort):
+    if port.has("center"):
         words.append("its dome is off its centre, or")
-    elif not isinstance(port, FlatPort):
+    elif not port.refracts:
         words.append(
             "its lens was calibrated in air and its port is missing in the rig file, or"
         )
-    elif turn_deg <= MAX_TILT_TURN_DEG:
+    elif port.has("normal") and turn_deg <= MAX_TILT_TURN_DEG:
         words.append("its port is tilted by about four times that, or")
     return " ".join([*words, "its cam_from_rig is wrong"])
 

@@ -15,7 +15,8 @@ from uwsfm.errors import UwsfmError
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.joint_alignment import Link, Placement, align_jointly
 from uwsfm.geometry.rigid3 import Array
-from uwsfm.models.ports.port import DOME, KIND, port_from_row
+from uwsfm.models.ports.port import port_from_row, rows_with
+from uwsfm.models.ports.row import AXIS
 from uwsfm.rig.rig import Rig
 from uwsfm.scene import IndexArray
 from uwsfm.sfm.mapping.correspondences import Correspondences
@@ -168,9 +169,9 @@ def _set_housings(growing: GrowingMap, submaps: Sequence[Submap]) -> None:
         return np.average(np.array(rows), axis=0, weights=counts)
 
     ports, lenses = mean([s.ports for s in submaps]), mean([s.lenses for s in submaps])
-    flat = ports[:, KIND] != DOME
-    lengths = np.linalg.norm(ports[:, :3], axis=1)
-    ports[flat & (lengths > 0.0), :3] /= lengths[flat & (lengths > 0.0), None]
+    lengths = np.linalg.norm(ports[:, AXIS], axis=1)
+    normals = rows_with(ports, "normal") & (lengths > 0.0)
+    ports[normals, AXIS] /= lengths[normals, None]
     rotations = mean([rigid3.rotmat_from_quat(s.cam_from_rig[:, :4]) for s in submaps])
     shifts = mean([s.cam_from_rig[:, 4:] for s in submaps])
     # The mean of directions is shorter than they are, and the baseline is held.
