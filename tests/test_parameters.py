@@ -26,6 +26,8 @@ from uwsfm.calibration.parameters import (
     REFINABLE,
 )
 from uwsfm.cli.tables import calibration_table
+from uwsfm.models.ports import row
+from uwsfm.models.ports.port import KINDS
 from uwsfm.options.jobs import (
     CalibrateHousingOptions,
     ReconstructOptions,
@@ -35,7 +37,7 @@ from uwsfm.report.tables import estimates, held_words
 from uwsfm.residuals import border
 from uwsfm.results.refined import listed
 from uwsfm.rig.schema import CameraAccuracyEntry, RigAccuracyEntry
-from uwsfm.solver.state import PORT_COLUMNS, RADIUS_OR_DISTANCE
+from uwsfm.solver.state import PORT_COLUMNS
 from uwsfm.trust.diagnosis import KEPT
 from uwsfm.trust.halves_reason import NAMES
 
@@ -77,18 +79,27 @@ def test_an_entry_has_all_facts(parameter):
     assert (parameter.column is None) == (parameter not in OF_PORTS)
 
 
-@pytest.mark.parametrize("port", ["flat", "dome", "none"])
+GLASS = {border.THICKNESS, border.GLASS_INDEX}
+OF_NO_USE = {
+    "flat": {border.RADIUS},
+    "dome": set(),
+    "interface": {border.RADIUS, *GLASS},
+    "none": {*range(border.BORDER_SIZE)[border.PLACE], border.RADIUS, *GLASS}
+    | {border.WATER_INDEX},
+}
+"""Slots that cameras behind such ports have no parameter for."""
+
+
+@pytest.mark.parametrize("port", KINDS)
 def test_no_slot_has_two_parameters(port):
-    taken = [s for p in PARAMETERS if port in p.ports for s in slots_of(p)]
+    taken = [s for p in PARAMETERS if p.of(port) for s in slots_of(p)]
     assert len(taken) == len(set(taken))
-    free = {"flat": {border.RADIUS}, "dome": set()}
-    if port in free:
-        assert set(taken) == set(range(border.BORDER_SIZE)) - free[port]
+    assert set(taken) == set(range(border.BORDER_SIZE)) - OF_NO_USE[port.word]
 
 
 def test_numbers_of_ports_stand_where_the_solver_moves_them():
     columns = {p.first: p.column for p in OF_PORTS}
-    both = {DISTANCE.first: RADIUS_OR_DISTANCE, RADIUS.first: RADIUS_OR_DISTANCE}
+    both = {DISTANCE.first: row.DISTANCE, RADIUS.first: row.RADIUS}
     assert columns == {**PORT_COLUMNS, **both}
 
 

@@ -247,9 +247,9 @@ def _placement(
 def _lens(
     both: tuple[CalibrationResult, CalibrationResult], camera: int
 ) -> Iterator[_Reading]:
-    lenses = [result.scene.cameras[camera].camera for result in both]
-    for index, slot in enumerate(param_slots(lenses[0].model_name)):
-        values = np.array([float(lens.params[index]) for lens in lenses])
+    first, second = (result.scene.cameras[camera].camera for result in both)
+    for index, slot in enumerate(param_slots(first.model_name)):
+        values = np.array([first.params[index], second.params[index]], dtype=float)
         place = border.FIRST_LENS + slot
         yield _single(lens_parameter(place), values, LENS_NAMES[slot], place)
 
