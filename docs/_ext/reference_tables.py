@@ -36,7 +36,8 @@ PAGES_OF_API = {
     "MatchOptions StartOptions",
     "Read a rig and a result": "load_rig Rig open_result Result read_model Model "
     "write_report",
-    "Cameras and ports": "RefractiveCamera FlatPort DomePort NoPort Status",
+    "Cameras and ports": "RefractiveCamera FlatPort DomePort InterfacePort NoPort "
+    "Status",
     "Adjust arrays of your own": "Scene calibrate CalibrateOptions CalibrationResult "
     "Lengths Distances Positions perspective_adjustment",
     "Uncertainty and verdict": "predict_covariance error_budget with_budget verdicts "
