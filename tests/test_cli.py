@@ -246,7 +246,7 @@ def test_unsupported_lens_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--prior", "distance=1"], "--prior distance=1: the key is one of distance_s"),
+        (["--prior", "distance=1"], "--prior distance=1: the key is one of normal_s"),
         (["--prior", "focal_stddev=a"], "'a' is not a number"),
         (["--error", "point_3d"], "hold the distances"),
         (["--fundamental-max-error", "3"], "give matcher 'paper'"),

@@ -95,8 +95,10 @@ def test_other_ways_to_the_same_floor(dive: DenseDive, tmp_path, monkeypatch, ca
     normal = np.linalg.svd(cloud.points - middle, full_matrices=False)[2][2]
     height = np.abs((cloud.points - middle) @ normal)
     # 0.67 if errors were normal. Those of neighbouring depths are alike, and 36 % less
-    # or 30 % more is what three frames leave.
-    assert 0.43 < np.median(height / cloud.stddev) < 0.88
+    # or 30 % more is what three frames leave. Depth maps by PatchMatch are all of the
+    # same images here: half of their errors counts as common, too much on a plane.
+    least = 0.43 if case != "patchmatch" else 0.43 * np.sqrt(0.5)
+    assert least < np.median(height / cloud.stddev) < 0.88
     assert np.median(height) < (0.0003 if case == "patchmatch" else 0.0006)
     assert np.median(np.abs(cloud.normals @ normal)) > 0.99
 
@@ -111,10 +113,10 @@ def test_each_depth_has_the_deviation_of_its_own_pixel(dive_result):
     uncertain = replace(result.calibration, covariance=replace(covariance, border=only))
     depths = maps.DepthMaps(replace(result, calibration=uncertain), Path("images"))
     depths.prepare_errors()
-    view = next(view for view in depths.views if view.pair == (0, 1))
+    index = [view.pair for view in depths.views].index((0, 1))
     ranges = np.full((600, 800), 1.6, dtype=np.float32)
     ranges[300:, :] = 2.1  # a step across the image
-    found = depths._calibration(view, DepthMap(ranges=ranges, sensitivity=ranges))
+    found = depths._calibration(index, DepthMap(ranges=ranges, sensitivity=ranges))
     columns, rows = (n.ravel() for n in np.meshgrid([150, 400, 650], [120, 280, 470]))
     xy = np.column_stack([columns, rows]) + 0.5
     expected = range_errors(scene, (0.0, 0.002), xy, ranges[rows, columns])
