@@ -9,7 +9,14 @@ from dense_scenes import Plane, range_errors
 from uwsfm.calibration.uncertainty import predict_covariance
 from uwsfm.dense.calibration_error import CalibrationError
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
-from uwsfm.dense.fuse import Rule, fuse, noise_px, placed, robust_stddev
+from uwsfm.dense.fuse import (
+    Noise,
+    Rule,
+    differences_px,
+    fuse,
+    placed,
+    robust_stddev,
+)
 from uwsfm.dense.options import DenseOptions, bytes_of
 from uwsfm.dense.voxels import BYTES_PER_VOXEL, Fused, Voxels
 from uwsfm.errors import InputError
@@ -20,6 +27,7 @@ from uwsfm.simulate.rigs import sample_rig
 from uwsfm.simulate.trajectories import level_poses, rich_motion
 
 NOISE_PX = 0.2
+NOISE = Noise(own=NOISE_PX, between=NOISE_PX)
 SENSITIVITY = 0.01  # metres per pixel, about that of the sample at two metres
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, 0.01)
 
@@ -53,14 +61,16 @@ def maps_of_floor(rng, num: int, bump: float = 0.0, noise: float = NOISE_PX):
 def test_depth_maps_tell_their_noise_and_average_it(rng: np.random.Generator):
     maps = maps_of_floor(rng, 5)
     found = robust_stddev(
-        np.concatenate([noise_px(view, maps[:i]) for i, view in enumerate(maps)])
+        np.concatenate(
+            [differences_px(view, maps[:i])[:, 0] for i, view in enumerate(maps)]
+        )
     )
     # Lookups between pixels average up to four of the other map's: 2/3 of a variance
     # on average and in each direction, (1 + 4/9) / 2 of both together.
     assert found == pytest.approx(NOISE_PX * np.sqrt(13.0 / 18.0), rel=0.1)
     image = np.zeros((60, 80, 3), dtype=np.uint8)
     fused, counts = fuse(
-        *(maps[0], maps[1:], image, NOISE_PX), Rule(min_views=3, keep_single=False)
+        *(maps[0], maps[1:], image, NOISE), Rule(min_views=3, keep_single=False)
     )
     all_agree = fused.num_views == 5
     height = fused.points[all_agree, 2]
@@ -101,8 +111,25 @@ def test_noise_that_depth_maps_of_the_same_images_share_is_made_up_for(rng, comm
     assert maps[0].alone(maps[1]) == pytest.approx(1.0 - share)
     # Of the same camera at the same place, so that pixels meet pixels.
     second = replace(maps[1], cam_from_world=maps[0].cam_from_world)
+    between, own = np.std(differences_px(maps[0], [second]), axis=0)
     # Some 290 samples: 4 %.
-    assert np.std(noise_px(maps[0], [second])) == pytest.approx(NOISE_PX, rel=0.15)
+    assert own == pytest.approx(NOISE_PX, rel=0.15)
+    assert between == pytest.approx(np.sqrt(1.0 - share) * own, rel=1e-6)
+    # By the one they agree, by the other is said how well a point is known.
+    image = np.zeros((*shape, 3), dtype=np.uint8)
+    rule = Rule(min_views=2, keep_single=False)
+    points = {}
+    for name, noise in (
+        ("both", NOISE),
+        ("less between", Noise(own=NOISE_PX, between=0.3 * NOISE_PX)),
+        ("less own", Noise(own=0.3 * NOISE_PX, between=NOISE_PX)),
+    ):
+        points[name], _ = fuse(maps[0], [second], image, noise, rule)
+    assert len(points["less between"]) < 0.9 * len(points["both"])
+    assert len(points["less own"]) == len(points["both"])
+    np.testing.assert_allclose(
+        points["less own"].stddev, 0.3 * points["both"].stddev, rtol=1e-9
+    )
 
 
 def test_errors_of_the_calibration_are_in_every_point_and_not_averaged(rng):
@@ -114,8 +141,8 @@ def test_errors_of_the_calibration_are_in_every_point_and_not_averaged(rng):
     uncertain = replace(plain[0], calibration=systematic.astype(np.float32))
     image = np.zeros((*shape, 3), dtype=np.uint8)
     rule = Rule(min_views=2, keep_single=False)
-    without, _ = fuse(plain[0], plain[1:], image, NOISE_PX, rule)
-    found, _ = fuse(uncertain, plain[1:], image, NOISE_PX, rule)
+    without, _ = fuse(plain[0], plain[1:], image, NOISE, rule)
+    found, _ = fuse(uncertain, plain[1:], image, NOISE, rule)
     np.testing.assert_array_equal(found.points, without.points)
     # Which pixel a point is of: the one that it projects to.
     pose = plain[0].cam_from_world
@@ -130,15 +157,15 @@ def test_what_others_contradict_is_dropped(rng: np.random.Generator):
     image = np.zeros((60, 80, 3), dtype=np.uint8)
     image[..., 0] = 200  # blue
     rule = Rule(min_views=2, keep_single=True)
-    fused, counts = fuse(maps[3], maps[:3], image, NOISE_PX, rule)
+    fused, counts = fuse(maps[3], maps[:3], image, NOISE, rule)
     # Ten standard deviations off; its border has no normal.
     assert counts.num_contradicted >= 250
     assert np.all(np.abs(fused.points[:, 2]) < 0.03)
     assert np.all(fused.colors == [0, 0, 200])
-    alone, _ = fuse(maps[3], [], image, NOISE_PX, rule)
+    alone, _ = fuse(maps[3], [], image, NOISE, rule)
     assert np.all(alone.num_views == 1) and len(alone) > 4000
     strict = Rule(min_views=2, keep_single=False)
-    nothing, _ = fuse(maps[3], [], image, NOISE_PX, strict)
+    nothing, _ = fuse(maps[3], [], image, NOISE, strict)
     assert len(nothing) == 0
 
 
@@ -151,7 +178,7 @@ def test_a_point_is_plain_where_no_depth_map_has_it_by_texture(rng):
     rule = Rule(min_views=3, keep_single=False)
     plain = replace(maps[0], plain=everywhere)
     others = [replace(maps[1], plain=left), replace(maps[2], plain=left)]
-    fused, _ = fuse(plain, others, image, NOISE_PX, rule)
+    fused, _ = fuse(plain, others, image, NOISE, rule)
     expected = np.ones(len(fused), dtype=bool)
     for other in maps[1:]:
         in_cam = rigid3.transform(other.cam_from_world, fused.points)
@@ -160,7 +187,7 @@ def test_a_point_is_plain_where_no_depth_map_has_it_by_texture(rng):
     # Each lookup is of the nearest pixel: at the line itself either is right.
     assert np.mean(fused.plain == expected) > 0.98
     assert 0.2 < np.mean(expected) < 0.8
-    sure, _ = fuse(maps[0], others, image, NOISE_PX, rule)
+    sure, _ = fuse(maps[0], others, image, NOISE, rule)
     assert not sure.plain.any()
 
 
@@ -169,7 +196,7 @@ def test_colours_beside_a_step_and_from_aside_and_afar_count_little(rng):
     maps = maps_of_floor(rng, 4, bump=0.3)
     image = np.zeros((60, 80, 3), dtype=np.uint8)
     rule = Rule(min_views=1, keep_single=True)
-    fused, _ = fuse(maps[3], [], image, NOISE_PX, rule)
+    fused, _ = fuse(maps[3], [], image, NOISE, rule)
     weight = np.full(image.shape[:2], np.nan)
     weight[np.isfinite(maps[3].distance) & np.isfinite(maps[3].normals[..., 0])] = (
         fused.color_weight
@@ -186,9 +213,9 @@ def test_bands_of_rows_give_what_the_whole_map_gives(rng: np.random.Generator):
     maps = maps_of_floor(rng, 4, bump=0.3)
     image = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
     rule = Rule(min_views=2, keep_single=False)
-    whole, counts = fuse(maps[3], maps[:3], image, NOISE_PX, rule)
+    whole, counts = fuse(maps[3], maps[:3], image, NOISE, rule)
     bands = [
-        fuse(maps[3], maps[:3], image, NOISE_PX, rule, slice(top, top + 17))
+        fuse(maps[3], maps[:3], image, NOISE, rule, slice(top, top + 17))
         for top in range(0, 60, 17)
     ]
     for name, expected in vars(whole).items():

@@ -75,6 +75,17 @@ class Placed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Standard deviations in pixels of disparity."""
+
+    own: float
+    """Of a depth map from the surface."""
+    between: float
+    """Of one depth map from another, per root of two: less, as they have images in
+    common. By this they agree or not."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rule:
     """Which points are kept."""
 
@@ -108,11 +119,11 @@ class _Told:
     """(N, 2) its pixels."""
 
 
-def noise_px(view: Placed, others: list[Placed]) -> Array:
-    """Differences between depth maps in pixels of disparity, of both together (n,).
+def differences_px(view: Placed, others: list[Placed]) -> Array:
+    """Differences between depth maps in pixels of disparity, of both together (n, 2).
 
-    Where both see the same surface their spread is the noise of one disparity. What
-    depth maps of the same images have in common is made up for.
+    Where both see the same surface their spread is the noise of one disparity. In the
+    second column, what depth maps of the same images have in common is made up for.
     """
     rows = np.arange(0, view.distance.shape[0], _SAMPLE_STEP)
     columns = np.arange(0, view.distance.shape[1], _SAMPLE_STEP)
@@ -124,11 +135,11 @@ def noise_px(view: Placed, others: list[Placed]) -> Array:
     found = []
     for other in others:
         told = _told(other, in_world)
-        both = np.hypot(own[keep], told.sensitivity) * np.sqrt(view.alone(other))
-        found.append(told.difference / both)
-    all_px = np.concatenate(found) if found else np.empty(0)
-    with np.errstate(invalid="ignore"):
-        return all_px[np.abs(all_px) < _GATE_PX]
+        px = told.difference / np.hypot(own[keep], told.sensitivity)
+        with np.errstate(invalid="ignore"):
+            px = px[np.abs(px) < _GATE_PX]
+        found.append(np.column_stack([px, px / np.sqrt(view.alone(other))]))
+    return np.concatenate(found) if found else np.empty((0, 2))
 
 
 def robust_stddev(values: Array) -> float | None:
@@ -146,7 +157,7 @@ def fuse(
     view: Placed,
     others: list[Placed],
     image: NDArray[np.uint8],
-    noise: float,
+    noise: Noise,
     rule: Rule,
     rows: slice = slice(None),
 ) -> tuple[Fused, FuseCounts]:
@@ -156,7 +167,7 @@ def fuse(
         view: the depth map.
         others: its neighbours.
         image: (H, W, 3) of the view, blue, green, red.
-        noise: standard deviation of a disparity, pixels.
+        noise: of their disparities.
         rule: what is kept.
         rows: of the depth map; memory grows with them.
     """
@@ -184,7 +195,7 @@ def fuse(
         turn = np.einsum("ni,ni->n", normals, told.sight) / slant
         turn = np.clip(turn, 1.0 / 3.0, 3.0)
         agrees = verdicts.hear(
-            *(noise * np.sqrt(view.alone(other)), sensitivity),
+            *(noise.between, sensitivity),
             *(told.difference * turn, told.sensitivity * turn),
         )
         asked = np.flatnonzero(plain & agrees)
@@ -201,7 +212,7 @@ def fuse(
         points=points[keep],
         normals=normals[keep],
         colors=image.reshape(-1, 3)[kept][:, ::-1],
-        stddev=np.sqrt(noise**2 / weight[keep] + systematic**2),
+        stddev=np.sqrt(noise.own**2 / weight[keep] + systematic**2),
         num_views=verdicts.num_views[keep],
         view_range=distance[keep],
         plain=plain[keep],
@@ -255,7 +266,7 @@ class _Verdicts:
         """One of them; with which points it agrees.
 
         Args:
-            noise: standard deviation of a disparity, pixels, as differences show it.
+            noise: `Noise.between`.
             own: (N,) metres per pixel of disparity.
             step: (N,) how much farther it has the surface; NaN where it has none.
             spread: (N,) its metres per pixel.

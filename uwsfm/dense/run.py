@@ -23,7 +23,15 @@ from uwsfm._base.partial import remove_stale
 from uwsfm._base.progress import Progress, silent
 from uwsfm.cloud import Cloud, write_cloud
 from uwsfm.dense.exposure import balancing_gains
-from uwsfm.dense.fuse import FuseCounts, Placed, Rule, fuse, noise_px, robust_stddev
+from uwsfm.dense.fuse import (
+    FuseCounts,
+    Noise,
+    Placed,
+    Rule,
+    differences_px,
+    fuse,
+    robust_stddev,
+)
 from uwsfm.dense.maps import DepthMaps
 from uwsfm.dense.options import ASSUMED_NOISE_PX, DenseOptions
 from uwsfm.dense.plan import FUSE_PIXELS, PLACED_BYTES, Load, Plan, plan
@@ -165,7 +173,7 @@ class _Run:
             "unit": unit,
             "voxel": size,
             "voxel_asked": voxel,
-            "noise_px": noise,
+            "noise_px": noise.own,
             "noise_from": "assumed" if assumed else "differences between depth maps",
             "calibration_stddev_max": self._calibration_summary(),
             "stddev_percentiles": _percentiles(cloud.stddev),
@@ -254,22 +262,24 @@ class _Run:
         largest = self.maps.largest_errors()
         return {f"{a}-{b}": value for (a, b), value in largest.items()}
 
-    def _noise(self) -> tuple[float, bool]:
-        """Standard deviation of a disparity, and whether it is only assumed."""
+    def _noise(self) -> tuple[Noise, bool]:
+        """That of the disparities, and whether it is only assumed."""
         self.maps.prepare_errors()
         self.near = neighbours(self.model, self.views, self.options.max_neighbours)
         if self.options.noise_px is not None:
-            return self.options.noise_px, True
+            return _alike(self.options.noise_px), True
         samples = []
         step = max(1, len(self.views) // _NOISE_VIEWS)
         chosen = range(0, len(self.views), step)
         for done, index in enumerate(chosen):
             self.progress("noise", done, len(chosen))
             others = [self.store.get(i) for i in self.near[index][:_NOISE_NEIGHBOURS]]
-            samples.append(noise_px(self.store.get(index), others))
+            samples.append(differences_px(self.store.get(index), others))
         self.progress("noise", len(chosen), len(chosen))
-        found = robust_stddev(np.concatenate(samples))
-        return (ASSUMED_NOISE_PX, True) if found is None else (found, False)
+        between, own = (robust_stddev(px) for px in np.concatenate(samples).T)
+        if between is None or own is None:
+            return _alike(ASSUMED_NOISE_PX), True
+        return Noise(own=own, between=between), False
 
     def _footprint(self) -> float:
         """Of a pixel at the median distance."""
@@ -284,7 +294,7 @@ class _Run:
         return float(np.median(found))
 
     def _fuse_all(
-        self, noise: float, voxel: float
+        self, noise: Noise, voxel: float
     ) -> tuple[dict[str, Any], Cloud, float]:
         """Counts, the cloud, and the voxels' size."""
         scene = self.model.scene
@@ -333,7 +343,7 @@ class _Run:
         return np.rint(np.clip(image, 0.0, 255.0)).astype(np.uint8)
 
     def _fuse_one(
-        self, index: int, rows: slice, noise: float
+        self, index: int, rows: slice, noise: Noise
     ) -> tuple[Fused, FuseCounts]:
         return fuse(
             self.store.get(index),
@@ -343,6 +353,10 @@ class _Run:
             self.rule,
             rows,
         )
+
+
+def _alike(noise_px: float) -> Noise:
+    return Noise(own=noise_px, between=noise_px)
 
 
 class _Store:
