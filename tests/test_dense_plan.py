@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from uwsfm.cli.dense import _larger_voxels
-from uwsfm.dense.plan import Load, fused_bytes, plan
+from uwsfm.dense.plan import Load, band_bytes, compared_bytes, plan
 from uwsfm.errors import InputError
 
 LOAD = Load(pixels=[270_000] * 42, map_bytes=3e8, is_stereo=False, neighbours=8)
@@ -16,8 +16,10 @@ def test_all_that_is_planned_fits():
         found = plan(LOAD, memory, 4e8, threads=8)
         room = memory - 4e8
         assert found.matchers * LOAD.map_bytes <= room
-        fuse = fused_bytes(270_000, 8) * found.fusers
-        assert fuse + found.store_bytes + found.voxel_bytes <= room * 1.0001
+        # Depth maps that are compared are among those that are kept.
+        maps = max(found.fusers * compared_bytes(270_000, 8), found.store_bytes)
+        bands = found.fusers * band_bytes(270_000)
+        assert maps + bands + found.voxel_bytes <= room * 1.0001
 
 
 def test_little_memory_means_fewer_at_a_time_and_more_time():

@@ -74,9 +74,17 @@ def fused_bytes(pixels: int, compared: int) -> float:
         pixels: of it.
         compared: depth maps that it is compared with.
     """
-    return (
-        FUSE_BYTES * min(pixels, FUSE_PIXELS) + PLACED_BYTES * (1 + compared) * pixels
-    )
+    return band_bytes(pixels) + compared_bytes(pixels, compared)
+
+
+def band_bytes(pixels: int) -> float:
+    """Of the rows that are fused at once."""
+    return float(FUSE_BYTES * min(pixels, FUSE_PIXELS))
+
+
+def compared_bytes(pixels: int, compared: int) -> float:
+    """Of a depth map and those that it is compared with."""
+    return float(PLACED_BYTES * (1 + compared) * pixels)
 
 
 def plan(load: Load, max_memory: float, used: float, threads: int) -> Plan:
@@ -106,6 +114,9 @@ def plan(load: Load, max_memory: float, used: float, threads: int) -> Plan:
     store = STORE_SHARE * room
     each = STEREO_SECONDS if load.is_stereo else MONO_SECONDS
     megapixels = sum(load.pixels) / 1e6
+    # Those that are compared are among those that are kept, as far as these reach.
+    beyond = max(fusers * compared_bytes(largest, compared) - store, 0.0)
+    fusing = fusers * band_bytes(largest) + beyond
     return Plan(
         num_maps=len(load.pixels),
         megapixels=largest / 1e6,
@@ -113,7 +124,7 @@ def plan(load: Load, max_memory: float, used: float, threads: int) -> Plan:
         match_bytes=room / matchers,
         fusers=fusers,
         store_bytes=store,
-        voxel_bytes=max(room - store - fusers * fuse, 0.1 * room),
+        voxel_bytes=max(room - store - fusing, 0.1 * room),
         seconds=megapixels * (each / matchers + FUSE_SECONDS / fusers),
         peak_bytes=max_memory,
     )

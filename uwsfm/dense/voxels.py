@@ -24,7 +24,8 @@ COARSER = 2.0**0.5
 """Of a side, so that half of the voxels of a surface remain."""
 _BITS = 21
 _PARTS = 16
-_PENDING = 1_000_000
+_PENDING = 500_000
+"""Rows that wait: sorting them takes three times their memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
