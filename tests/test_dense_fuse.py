@@ -7,7 +7,7 @@ import pytest
 from dense_scenes import Plane, range_errors
 
 from uwsfm.calibration.uncertainty import predict_covariance
-from uwsfm.dense.calibration_error import CalibrationError
+from uwsfm.dense.calibration_error import calibration_error
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.fuse import (
     Noise,
@@ -314,7 +314,7 @@ def test_uncertain_ports_make_the_depths_uncertain(how):
     for (camera, slot), amount in OFF_BY[how].items():
         error[covariance.border_cols[camera, slot]] = amount
     only = np.outer(error, error)  # one error, in all of them at once
-    found = CalibrationError(scene, replace(covariance, border=only), (0, 1), 1.0, 3.0)
+    found = calibration_error(scene, replace(covariance, border=only), (0, 1), 1.0, 3.0)
     # Nodes of the grid: 8 by 6 steps between the outer pixels of 800 x 600, and three
     # in the inverse range from 1 to 1/3.
     xy = np.array([[400.0, 300.0], [0.5 + 799.0 / 4.0, 0.5 + 599.0 / 3.0]])

@@ -99,8 +99,7 @@ def _by_axis(parameter: Parameter, stddevs: dict[int, float]) -> Iterator[_Numbe
 
 
 def _amount(parameter: Parameter, stddev: float) -> str:
-    unit = f" {parameter.unit.name}" if parameter.unit.name else ""
-    return f"+{parameter.unit.per * stddev:.3g}{unit}"
+    return f"+{parameter.unit.shown(stddev, '.3g')}"
 
 
 def _lens_numbers(lens: Array, stddevs: dict[int, float]) -> Iterator[_Number]:

@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from uwsfm.models.ports.port import Port
 
-N_WATER = "n_water"
-"""The number that every port has which refracts."""
-
 
 @dataclass(frozen=True)
 class Unit:
@@ -21,6 +18,20 @@ class Unit:
     """How many of it make one unit in memory."""
     in_files: str = ""
     """The unit in memory, where a name in a file needs it."""
+
+    def shown(self, value: float, digits: str) -> str:
+        """A value in memory, for people.
+
+        Args:
+            value: what is shown.
+            digits: a format, as ".3g".
+        """
+        return f"{self.per * value:{digits}} {self.name}".rstrip()
+
+    @property
+    def noted(self) -> str:
+        """What a name in a file has behind it."""
+        return f" ({self.in_files})" if self.in_files else ""
 
 
 MILLIMETRE = Unit("mm", 1e3, "m")
@@ -95,8 +106,8 @@ class Parameter:
     unit: Unit
     accuracy: Accuracy | None = None
     number: str | None = None
-    """Of ports, as `uwsfm.models.ports.kind.FILE_KEYS` and `N_WATER` have them: cameras
-    behind ports that have it. None: all cameras."""
+    """Of ports, as `uwsfm.models.ports.kind.Port.has` takes it: cameras behind ports
+    that have it. None: all cameras."""
     column: int | None = None
     """Of a single number: where it is in the row of a port."""
     step: str = ""
@@ -125,9 +136,12 @@ class Parameter:
 
     def of(self, port: "Port | type[Port]") -> bool:
         """Whether a camera behind such a port has it."""
-        if self.number is None:
-            return True
-        return port.refracts if self.number == N_WATER else port.has(self.number)
+        return self.number is None or port.has(self.number)
+
+    @property
+    def has_prior_by_accuracy(self) -> bool:
+        """Whether the accuracy of the rig file is its prior where none is given."""
+        return self.prior is not None and self.prior.from_accuracy
 
     def listed_name(self, camera: str, part: str = "") -> str:
         """What a list calls it, with its unit if that is not plain.
@@ -136,5 +150,4 @@ class Parameter:
             camera: that it is of.
             part: name of one of several numbers.
         """
-        unit = f" ({self.unit.in_files})" if self.unit.in_files else ""
-        return f"{part or self.name} of {camera}{unit}"
+        return f"{part or self.name} of {camera}{self.unit.noted}"

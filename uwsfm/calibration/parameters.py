@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 from uwsfm.calibration.parameter import (
     DEGREE,
     MILLIMETRE,
-    N_WATER,
     NUMBER,
     PIXEL,
     Accuracy,
@@ -213,7 +212,7 @@ WATER_INDEX = Parameter(
     plural="water indices",
     slots=border.WATER_INDEX,
     unit=NUMBER,
-    number=N_WATER,
+    number="n_water",
     column=row.N_WATER,
     bounds=(1.0, 4.0),
     listed=True,

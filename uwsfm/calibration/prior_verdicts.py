@@ -27,7 +27,7 @@ def prior_verdict(
     Returns:
         None for what has a prior only if somebody gives one.
     """
-    if parameter.prior is None or not parameter.prior.from_accuracy:
+    if not parameter.has_prior_by_accuracy:
         return None
     stddev, prior = _with_prior(result, parameter, camera)
     if stddev < DETERMINED_BY_IMAGES * prior:
@@ -58,12 +58,13 @@ def held_by_priors(result: CalibrationResult, names: Sequence[str]) -> list[str]
             if not (refined and has and each.prior is not None):
                 continue
             if prior_verdict(result, each, c) == "held by the prior":
-                stddev, prior = _with_prior(result, each, c)
-                unit = f" {each.unit.name}".rstrip()
-                left, known = each.unit.per * stddev, each.unit.per * prior
+                left, known = (
+                    each.unit.shown(stddev, ".2g")
+                    for stddev in _with_prior(result, each, c)
+                )
                 sentences.append(
                     f"the {each.name} of {name} is held by the prior: the images leave "
-                    f"± {left:.2g}{unit} of its ± {known:.2g}{unit}; hold it, or "
-                    "measure it and state its accuracy in the rig file"
+                    f"± {left} of its ± {known}; hold it, or measure it and state its "
+                    "accuracy in the rig file"
                 )
     return sentences

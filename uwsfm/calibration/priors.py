@@ -73,7 +73,7 @@ def prior_stddevs(
                 per = lenses[:, first : first + parameter.size]
             rows = np.arange(parameter.first, parameter.first + parameter.size)
             stddevs[np.ix_(has, rows)] = known * per[has]
-        elif parameter.prior.from_accuracy:
+        elif parameter.has_prior_by_accuracy:
             refined = has & (columns[:, parameter.first] != HELD)
             if refined.any():
                 _take_accuracy(scene, settings, parameter, refined, stddevs)

@@ -182,8 +182,7 @@ class CalibrateOptions(_OfParameters):
         return [
             each
             for each in PARAMETERS
-            if each.prior is not None
-            and each.prior.from_accuracy
+            if each.has_prior_by_accuracy
             and each.refine is not None
             and np.any(getattr(self, each.refine.field))
         ]

@@ -8,10 +8,9 @@ make it smaller.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.interpolate import RegularGridInterpolator
 
 from uwsfm.calibration.result import Covariance
+from uwsfm.dense.range_error import RangeError, RangeGrid
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rays import closest_points
 from uwsfm.geometry.rigid3 import Array
@@ -26,7 +25,13 @@ _STEP = 1e-6
 """Metres, radians, pixels: differences lose six digits of sixteen to it."""
 
 
-class CalibrationError:
+def calibration_error(
+    scene: Scene,
+    covariance: Covariance,
+    pair: tuple[int, int],
+    near: float,
+    far: float,
+) -> RangeError:
     """Standard deviation of a pair's ranges from the covariance of its calibration.
 
     Args:
@@ -35,53 +40,34 @@ class CalibrationError:
         pair: left and right camera.
         near, far: limits of the ranges, metres.
     """
-
-    def __init__(
-        self,
-        scene: Scene,
-        covariance: Covariance,
-        pair: tuple[int, int],
-        near: float,
-        far: float,
-    ) -> None:
-        left, right = pair
-        camera = scene.cameras[left]
-        columns, rows, depths = _GRID
-        x = np.linspace(0.5, camera.width - 0.5, columns)
-        y = np.linspace(0.5, camera.height - 0.5, rows)
-        inverse = np.linspace(1.0 / far, 1.0 / near, depths)
-        grid = np.meshgrid(y, x, inverse, indexing="ij")
-        xy = np.stack([grid[1].ravel(), grid[0].ravel()], axis=1)
-        origins, dirs = camera.ray_from_img(xy)
-        points = origins + dirs / grid[2].reshape(-1, 1)
-        right_from_left = _relative(scene.cam_from_rig, pair)
-        shown, _ = scene.cameras[right].img_from_point(
-            rigid3.transform(right_from_left, points)
-        )
-        at_optimum = _ranges(scene.cameras, right_from_left, pair, xy, shown)
-        jac = np.zeros((len(xy), len(covariance.border)))
-        for column, moved in _moved_scenes(scene, covariance, pair):
-            relative = _relative(moved.cam_from_rig, pair)
-            ranges = _ranges(moved.cameras, relative, pair, xy, shown)
-            jac[:, column] = (ranges - at_optimum) / _STEP
-        variance = np.einsum("na,ab,nb->n", jac, covariance.border, jac)
-        # What the right image does not show has the deviation of what it does.
-        known = np.isfinite(variance)
-        fallback = float(np.median(variance[known])) if known.any() else np.nan
-        stddev = np.sqrt(np.where(known, np.maximum(variance, 0.0), fallback))
-        self._limits = inverse[0], inverse[-1]
-        self._interpolator = RegularGridInterpolator(
-            (y, x, inverse), stddev.reshape(rows, columns, depths), bounds_error=False
-        )
-        self.largest = float(np.max(stddev)) if known.any() else np.nan
-
-    def stddev(self, xy: ArrayLike, ranges: ArrayLike) -> Array:
-        """Standard deviations (N,) at left pixels (N, 2) and ranges (N,), metres."""
-        pixels = np.asarray(xy, dtype=np.float64)
-        inverse = np.clip(1.0 / np.asarray(ranges, dtype=np.float64), *self._limits)
-        return self._interpolator(
-            np.column_stack([pixels[:, 1], pixels[:, 0], inverse])
-        )
+    left, right = pair
+    camera = scene.cameras[left]
+    columns, rows, depths = _GRID
+    grid = RangeGrid(
+        x=np.linspace(0.5, camera.width - 0.5, columns),
+        y=np.linspace(0.5, camera.height - 0.5, rows),
+        inverse=np.linspace(1.0 / far, 1.0 / near, depths),
+    )
+    xy, inverse = grid.nodes()
+    origins, dirs = camera.ray_from_img(xy)
+    points = origins + dirs / inverse[:, None]
+    right_from_left = _relative(scene.cam_from_rig, pair)
+    shown, _ = scene.cameras[right].img_from_point(
+        rigid3.transform(right_from_left, points)
+    )
+    at_optimum = _ranges(scene.cameras, right_from_left, pair, xy, shown)
+    jac = np.zeros((len(xy), len(covariance.border)))
+    for column, moved in _moved_scenes(scene, covariance, pair):
+        relative = _relative(moved.cam_from_rig, pair)
+        ranges = _ranges(moved.cameras, relative, pair, xy, shown)
+        jac[:, column] = (ranges - at_optimum) / _STEP
+    variance = np.einsum("na,ab,nb->n", jac, covariance.border, jac)
+    # What the right image does not show has the deviation of what it does.
+    known = np.isfinite(variance)
+    fallback = float(np.median(variance[known])) if known.any() else np.nan
+    return RangeError(
+        grid, np.sqrt(np.where(known, np.maximum(variance, 0.0), fallback))
+    )
 
 
 def _moved_scenes(scene: Scene, covariance: Covariance, pair: tuple[int, int]):

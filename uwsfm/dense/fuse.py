@@ -199,7 +199,7 @@ def fuse(
             *(told.difference * turn, told.sensitivity * turn),
         )
         asked = np.flatnonzero(plain & agrees)
-        mark = other.plain.astype(np.uint8)
+        mark = other.plain.view(np.uint8)
         plain[asked] = looked_up(mark, told.xy[asked], nearest=True) > 0
     weight = sensitivity**-2.0 + verdicts.weight
     points += (verdicts.moved / weight)[:, None] * sight

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwsfm.calibration.propagation import Propagation
-from uwsfm.dense.calibration_error import CalibrationError
+from uwsfm.dense.calibration_error import calibration_error
 from uwsfm.dense.depth_map import DepthMap, pixel_rows, read_depth_map, write_depth_map
 from uwsfm.dense.exposure import SeenColors
 from uwsfm.dense.fuse import Placed, placed
 from uwsfm.dense.lookup import looked_up
 from uwsfm.dense.options import MAX_PIXELS, MAX_STEREO_PIXELS, DenseOptions
 from uwsfm.dense.patchmatch_maps import PatchMatchMaps
-from uwsfm.dense.pose_error import RangeError, range_errors
+from uwsfm.dense.pose_error import range_errors
+from uwsfm.dense.range_error import RangeError
 from uwsfm.dense.stereo_maps import StereoMaps
 from uwsfm.dense.views import (
     View,
@@ -90,7 +91,7 @@ class DepthMaps:
                 MAX_PIXELS[options.quality],
             )
         self._calibrated = result.calibration
-        self._errors: list[CalibrationError | RangeError | None] = []
+        self._errors: list[RangeError | None] = []
 
     def _views(self, matcher: str) -> tuple[list[View], dict[tuple[int, int], str]]:
         """The views, and why pairs of cameras are not compared in rectified images."""
@@ -236,7 +237,7 @@ class DepthMaps:
             self._errors = [of_pairs[view.pair] for view in self.views]
         else:
             propagation = Propagation(self._calibrated)
-            self._errors = list(range_errors(self.model.scene, propagation, self.views))
+            self._errors = range_errors(self.model.scene, propagation, self.views)
 
     def largest_errors(self) -> dict[tuple[int, int], float | None]:
         """What `prepare_errors` found at most, of each pair of cameras."""
@@ -249,12 +250,12 @@ class DepthMaps:
     def _pairs(self) -> list[tuple[int, int]]:
         return sorted({view.pair for view in self.views})
 
-    def _pair_error(self, pair: tuple[int, int]) -> CalibrationError | None:
+    def _pair_error(self, pair: tuple[int, int]) -> RangeError | None:
         covariance = self._calibrated.covariance
         if not (covariance.determined and len(covariance.border)):
             return None
         of_pair = [view for view in self.views if view.pair == pair]
-        return CalibrationError(
+        return calibration_error(
             self.model.scene,
             covariance,
             pair,

@@ -127,8 +127,7 @@ class PatchMatch:
             The hypotheses, and (H, W, 5) of `uwsfm.dense.settle`.
         """
         for rounds in SECOND:
-            held = is_plain(for_scale(self._image, rounds.scale))
-            planes, costs, seen = self._run(planes, rounds, held)
+            planes, costs, seen = self._run(planes, rounds, hold_plain=True)
         found = np.empty((*planes.shape[:2], 5), dtype=np.float32)
         offsets = patch.patch_offsets(stride=1)
         roughs = np.array([rough(n.image) for n in self._neighbours], dtype=np.float32)
@@ -141,11 +140,11 @@ class PatchMatch:
         return planes, found
 
     def _run(
-        self, planes: Hypotheses, rounds: Rounds, held: NDArray[np.bool_] | None = None
+        self, planes: Hypotheses, rounds: Rounds, *, hold_plain: bool = False
     ) -> tuple[Any, Any, Any]:
         scale = rounds.scale
         image = for_scale(self._image, scale)
-        held = np.zeros(image.shape, dtype=bool) if held is None else held
+        held = is_plain(image) if hold_plain else np.zeros(image.shape, dtype=bool)
         seen = self._seen(scale)
         planes = _resized(planes, image.shape)
         num = len(self._neighbours)

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import RegularGridInterpolator
+from numpy.typing import NDArray
 
 from uwsfm.calibration.propagation import Propagation
+from uwsfm.dense.range_error import RangeError, RangeGrid
 from uwsfm.dense.views import View
 from uwsfm.geometry import rigid3
 from uwsfm.geometry.rigid3 import Array
@@ -28,35 +28,11 @@ _GRID = (6, 5, 3)
 as many cells."""
 
 
-class RangeError:
-    """Standard deviation of the ranges of one image, metres.
-
-    Args:
-        size: width and height of the image.
-        inverse: (D,) ascending inverse ranges of the grid.
-        stddev: (rows, columns, D), NaN where it is not known.
-    """
-
-    def __init__(self, size: tuple[int, int], inverse: Array, stddev: Array) -> None:
-        self.largest = float(np.nanmax(stddev))
-        rows, columns, _ = stddev.shape
-        filled = np.where(np.isfinite(stddev), stddev, np.nanmedian(stddev))
-        axes = *_centers(size, columns, rows)[::-1], inverse
-        self._low, self._high = (np.array([a[end] for a in axes]) for end in (0, -1))
-        self._interpolator = RegularGridInterpolator(axes, filled, bounds_error=False)
-
-    def stddev(self, xy: ArrayLike, ranges: ArrayLike) -> Array:
-        """Standard deviations (N,) at pixels (N, 2) and ranges (N,), metres."""
-        pixels = np.asarray(xy, dtype=np.float64)
-        inverse = 1.0 / np.asarray(ranges, dtype=np.float64)
-        at = np.column_stack([pixels[:, 1], pixels[:, 0], inverse])
-        return self._interpolator(np.clip(at, self._low, self._high))
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Moves:
     """How places that a view shows move along its sights."""
 
+    grid: RangeGrid
     shown: NDArray[np.bool_]
     """(G,) bool, of the grid: whether a neighbour shows it, too."""
     ranges: Array
@@ -78,74 +54,65 @@ def range_errors(
     if not propagation.determined:
         return [None for _ in views]
     moves = [_moves(scene, propagation, view) for view in views]
-    known = [each for each in moves if each.shown.any()]
+    known = [each for each in moves if each is not None]
     if not known:
         return [None for _ in views]
     count = sum(len(each.ranges) for each in known)
     common = sum(each.by_unknowns.T @ (1.0 / each.ranges) for each in known) / count
     found: list[RangeError | None] = []
-    for view, each in zip(views, moves, strict=True):
-        if not each.shown.any():
+    for each in moves:
+        if each is None:
             found.append(None)
             continue
         alone = each.by_unknowns.T.toarray() - common[:, None] * each.ranges
         stddev = np.full(len(each.shown), np.nan)
         stddev[each.shown] = np.sqrt(propagation.shared_variances(alone))
-        camera = scene.cameras[view.camera]
-        columns, rows, depths = _GRID
-        found.append(
-            RangeError(
-                (camera.width, camera.height),
-                _inverse_ranges(view),
-                stddev.reshape(rows, columns, depths),
-            )
-        )
+        known_here = np.isfinite(stddev)
+        stddev[~known_here] = np.median(stddev[known_here])
+        found.append(RangeError(each.grid, stddev))
     return found
 
 
-def _moves(scene: Scene, propagation: Propagation, view: View) -> _Moves:
+def _moves(scene: Scene, propagation: Propagation, view: View) -> _Moves | None:
+    """None: no neighbour shows anything of what the view does."""
     camera = scene.cameras[view.camera]
     rig_from_world = scene.rig_from_world[view.frame]
     rig_from_cam = rigid3.inverse(scene.cam_from_rig[view.camera])
-    x, y = _centers((camera.width, camera.height), *_GRID[:2])
-    grid = np.meshgrid(y, x, _inverse_ranges(view), indexing="ij")
-    origins, dirs = camera.ray_from_img(
-        np.stack([grid[1].ravel(), grid[0].ravel()], axis=1)
+    columns, rows, depths = _GRID
+    grid = RangeGrid(
+        x=_middles(0.0, camera.width, columns),
+        y=_middles(0.0, camera.height, rows),
+        inverse=_middles(1.0 / view.far, 1.0 / view.near, depths),
     )
-    ranges = 1.0 / grid[2].ravel()
+    at, inverse = grid.nodes()
+    origins, dirs = camera.ray_from_img(at)
+    ranges = 1.0 / inverse
     in_rig = rigid3.transform(rig_from_cam, origins + ranges[:, None] * dirs)
     points = rigid3.transform(rigid3.inverse(rig_from_world), in_rig)
-    images, places, pixels = [], [], []
-    for image in ((view.camera, view.frame), *view.others):
-        xy = _shown(scene, image, points)
-        there = np.flatnonzero(np.isfinite(xy[:, 0]))
-        images += [image] * len(there)
-        places.append(there)
-        pixels.append(xy[there])
-    place = np.concatenate(places)
-    shown = np.bincount(place, minlength=len(points)) > 1
-    keep = shown[place]
-    index = np.cumsum(shown) - 1
+    images = (view.camera, view.frame), *view.others
+    pixels = np.array([_shown(scene, image, points) for image in images])
+    there = np.isfinite(pixels[..., 0])
+    shown = np.count_nonzero(there, axis=0) > 1
+    if not shown.any():
+        return None
+    image, place = np.nonzero(there & shown)
     seen = replace(
         scene,
         points=points[shown],
-        camera_idx=np.array(images, dtype=np.int64)[keep, 0],
-        frame_idx=np.array(images, dtype=np.int64)[keep, 1],
-        point_idx=index[place[keep]],
-        xy=np.concatenate(pixels)[keep],
+        camera_idx=np.array(images, dtype=np.int64)[image, 0],
+        frame_idx=np.array(images, dtype=np.int64)[image, 1],
+        point_idx=(np.cumsum(shown) - 1)[place],
+        xy=pixels[image, place],
     )
-    if not shown.any():
-        nothing = sp.csr_array((0, 0))
-        return _Moves(shown=shown, ranges=np.empty(0), by_unknowns=nothing)
     moved = propagation.of_rays(seen, np.zeros(len(seen.points)))
     sights = rigid3.rotate(rig_from_cam, dirs)[shown]
     in_world = rigid3.rotate(rigid3.inverse(rig_from_world), sights)
     along = sp.block_diag(list(in_world[:, None]), format="csr")
-    by_unknowns = sp.csr_array(along @ moved.pull)
     return _Moves(
+        grid=grid,
         shown=shown,
         ranges=ranges[shown],
-        by_unknowns=by_unknowns
+        by_unknowns=sp.csr_array(along @ moved.pull)
         + _by_frame(propagation, view.frame, in_rig[shown], sights),
     )
 
@@ -180,14 +147,6 @@ def _shown(scene: Scene, image: tuple[int, int], points: Array) -> Array:
     xy, ok = lens.img_from_point(rigid3.transform(pose, points))
     ok &= np.all((xy >= 0.0) & (xy <= [lens.width, lens.height]), axis=1)
     return np.where(ok[:, None], xy, np.nan)
-
-
-def _centers(size: tuple[int, int], columns: int, rows: int) -> tuple[Array, Array]:
-    return _middles(0.0, size[0], columns), _middles(0.0, size[1], rows)
-
-
-def _inverse_ranges(view: View) -> Array:
-    return _middles(1.0 / view.far, 1.0 / view.near, _GRID[2])
 
 
 def _middles(low: float, high: float, count: int) -> Array:

@@ -74,16 +74,15 @@ def export_housing(
 def _glass(rig: Rig, calibration: CalibrationResult) -> list[RefinedNumber]:
     """Refined numbers whose accuracy was their prior, and is better known now."""
     columns = calibration.covariance.border_cols
-    kinds = [each for each in OF_PORTS if each.prior and each.prior.from_accuracy]
+    kinds = [each for each in OF_PORTS if each.has_prior_by_accuracy]
     if not any(np.any(columns[:, each.first] != HELD) for each in kinds):
         return []
     return [n for n in refined_numbers(rig, calibration) if n.parameter in kinds]
 
 
 def _comment(number: RefinedNumber, verdict: str) -> str:
-    unit = number.parameter.unit
     own, total = (
-        f"{unit.per * value:.4g} {unit.name}".rstrip()
+        number.parameter.unit.shown(value, ".4g")
         for value in (number.stddev, number.stddev_in_all)
     )
     return (

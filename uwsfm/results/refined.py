@@ -164,8 +164,7 @@ def listed(text: str) -> tuple[Parameter, str, str]:
     name, _, camera = text.partition(" of ")
     for each in PARAMETERS:
         if each.listed and each not in LENS and name.startswith(each.name):
-            unit = f" ({each.unit.in_files})" if each.unit.in_files else ""
-            return each, name, camera.removesuffix(unit) if unit else camera
+            return each, name, camera.removesuffix(each.unit.noted)
     if name in ("f", "fx", "fy"):
         return FOCAL, name, camera
     return (PRINCIPAL_POINT if name in ("cx", "cy") else DISTORTION), name, camera

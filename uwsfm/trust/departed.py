@@ -55,9 +55,8 @@ def _glass(item: Departure) -> Reason | None:
     if item.z < CONTRADICTED:
         return None
     each = next(p for p in OF_PORTS if p.accuracy and p.accuracy.key == item.what)
-    unit, per = f" {each.unit.name}".rstrip(), each.unit.per
     found, known = (
-        f"{per * value:.5g} ± {per * stddev:.2g}{unit}"
+        f"{each.unit.per * value:.5g} ± {each.unit.shown(stddev, '.2g')}"
         for value, stddev in (
             (item.estimate, item.stddev),
             (item.given, item.given_stddev),

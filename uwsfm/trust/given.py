@@ -240,8 +240,7 @@ def _glass(
     covariance, found = calibration.covariance, []
     for each in OF_PORTS:
         column = int(covariance.border_cols[index, each.first])
-        by_accuracy = each.prior is not None and each.prior.from_accuracy
-        if column == HELD or not by_accuracy or each.accuracy is None:
+        if column == HELD or not each.has_prior_by_accuracy or each.accuracy is None:
             continue
         columns = covariance.border_cols
         prior = prior_stddevs(calibration.scene, calibration.options, columns)

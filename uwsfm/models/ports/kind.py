@@ -126,8 +126,9 @@ class Port:
 
     @classmethod
     def has(cls, name: str) -> bool:
-        """Whether a port of this kind has a number, as "distance"."""
-        return name in cls.numbers
+        """Whether a port of this kind has a number, as "distance": one that rig files
+        state, or "n_water", which the rig has for all that refract."""
+        return name in cls.numbers or (name == "n_water" and cls.refracts)
 
     @classmethod
     def reads(cls, params: Array) -> bool:
